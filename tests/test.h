@@ -22,7 +22,8 @@
    REQUIRE does, and so does SKIP("why"), which makes it count as skipped unless a check had failed.
    Arguments: NAME runs only the tests whose name contains it; -v prints each test with its seconds.
    Environment: DIST_TEST_ISA=scalar|sse2|avx2|avx512|neon forces the instruction set of test_context_desc,
-   DIST_TEST_QUICK=1 asks for smaller cases (test_quick), DIST_DATA is the folder of test data, DIST_TMP one to write to.
+   DIST_TEST_QUICK=1 asks for smaller cases (test_quick), DIST_DATA is the folder of test data, DIST_TMP one for what
+   tests write.
    Tests run from the root of the repository. */
 #ifndef DIST_TEST_H
 #define DIST_TEST_H
@@ -45,7 +46,7 @@
 #define TEST_UNUSED
 #endif
 
-/* ---- running and counting ---------------------------------------------------------------------------------------------- */
+/* ---- running and counting ---------------------------------------------------------------------------------------- */
 
 enum { TEST_FAILURES_SHOWN = 10 };
 
@@ -84,7 +85,8 @@ TEST_UNUSED static void test_run(const char *name, void (*test_fn)(void))
     test_fn();
     if (test_state.checks_failed) {
         test_state.failed++;
-        printf("not ok %s: %d failed check%s\n", name, test_state.checks_failed, test_state.checks_failed == 1 ? "" : "s");
+        printf("not ok %s: %d failed check%s\n", name, test_state.checks_failed,
+               test_state.checks_failed == 1 ? "" : "s");
     } else if (test_state.skip_asked) {
         test_state.skipped++;
     } else {
@@ -101,7 +103,7 @@ TEST_UNUSED static void test_skip(const char *reason)
     printf("skip %s: %s\n", test_state.current ? test_state.current : test_state.program, reason);
 }
 
-/* Prints the sum as the last line; what main returns. Nothing run, by a filter that matches nothing, is a failure too. */
+/* Prints the sum as the last line; main returns it. To have run nothing, by a filter that fits no test, is a failure. */
 TEST_UNUSED static int test_report(void)
 {
     if (test_state.matched == 0 && !test_state.nothing_runs) {
@@ -121,7 +123,7 @@ TEST_UNUSED static int test_report(void)
         return;            \
     } while (0)
 
-/* ---- checks ------------------------------------------------------------------------------------------------------------ */
+/* ---- checks ------------------------------------------------------------------------------------------------------ */
 
 /* By the bits, since -ffast-math removes tests of the value. */
 TEST_UNUSED static int test_finite(double x)
@@ -144,7 +146,8 @@ TEST_UNUSED static int test_is_near(double expected, double got, double toleranc
     return fabs(expected - got) <= tolerance;
 }
 
-TEST_UNUSED static int test_near(double expected, double got, double tolerance, const char *what, const char *file, int line)
+TEST_UNUSED static int test_near(double expected, double got, double tolerance, const char *what, const char *file,
+                                 int line)
 {
     int good = test_is_near(expected, got, tolerance);
     if (!good && test_fail(file, line))
@@ -152,8 +155,8 @@ TEST_UNUSED static int test_near(double expected, double got, double tolerance, 
     return good;
 }
 
-TEST_UNUSED static int test_near_array(size_t n, const float *expected, const float *got, double tolerance, const char *what,
-                                       const char *file, int line)
+TEST_UNUSED static int test_near_array(size_t n, const float *expected, const float *got, double tolerance,
+                                       const char *what, const char *file, int line)
 {
     size_t wrong = 0, worst = 0;
     double worst_error = -1;
@@ -178,15 +181,15 @@ TEST_UNUSED static int test_equal(long long expected, long long got, const char 
     return expected == got;
 }
 
-TEST_UNUSED static int test_same_bytes(size_t bytes, const void *expected, const void *got, const char *what, const char *file,
-                                       int line)
+TEST_UNUSED static int test_same_bytes(size_t bytes, const void *expected, const void *got, const char *what,
+                                       const char *file, int line)
 {
     const unsigned char *a = (const unsigned char *)expected, *b = (const unsigned char *)got;
     size_t i = 0;
     while (i < bytes && a[i] == b[i]) i++;
     if (i < bytes && test_fail(file, line))
-        printf("%s: byte %lu of %lu: expected %02x, got %02x\n", what, (unsigned long)i, (unsigned long)bytes, (unsigned)a[i],
-               (unsigned)b[i]);
+        printf("%s: byte %lu of %lu: expected %02x, got %02x\n", what, (unsigned long)i, (unsigned long)bytes,
+               (unsigned)a[i], (unsigned)b[i]);
     return i == bytes;
 }
 
@@ -239,10 +242,10 @@ TEST_UNUSED static int test_status(dist_status expected, dist_status got, const 
         if (!CHECK(condition)) return; \
     } while (0)
 
-/* ---- a counting, failing allocator ------------------------------------------------------------------------------------- */
+/* ---- a counting, failing allocator ------------------------------------------------------------------------------- */
 
-/* Counts what is live, returns memory aligned to what was asked for and to no more, filled with 0xff (NaN as a float), and
-   checks at free that pointer and size are those of a live block and that nothing was written beyond its end.
+/* Counts what is live, returns memory aligned to what was asked for and to no more, filled with 0xff (NaN as a float),
+   and checks at free that pointer and size are those of a live block and that nothing was written beyond its end.
    Zero it, set fail_at if wanted, and hand test_allocator_hook(&a) to the context. */
 typedef struct test_allocator {
     size_t live_blocks, live_bytes, peak_bytes;
@@ -362,7 +365,7 @@ TEST_UNUSED static dist_allocator test_allocator_hook(test_allocator *a)
     return hook;
 }
 
-/* ---- a scheduler without threads --------------------------------------------------------------------------------------- */
+/* ---- a scheduler without threads --------------------------------------------------------------------------------- */
 
 /* Hands out tasks last first and a different worker each time, so that what depends on order or worker shows itself.
    Set workers, and the same in the context's desc. */
@@ -386,7 +389,7 @@ TEST_UNUSED static dist_scheduler test_scheduler_hook(test_scheduler *s)
     return hook;
 }
 
-/* ---- random numbers ---------------------------------------------------------------------------------------------------- */
+/* ---- random numbers ---------------------------------------------------------------------------------------------- */
 
 /* The same numbers everywhere for one seed. */
 typedef struct test_random {
@@ -448,7 +451,7 @@ TEST_UNUSED static void test_random_direction(test_random *r, float direction[3]
     direction[2] = (float)z;
 }
 
-/* ---- environment ------------------------------------------------------------------------------------------------------- */
+/* ---- environment ------------------------------------------------------------------------------------------------- */
 
 /* 1: slow surroundings (an emulator, a sanitizer); make the cases smaller, but leave none out without SKIP. */
 TEST_UNUSED static int test_quick(void)
@@ -481,8 +484,8 @@ TEST_UNUSED static int test_cpu_has(int isa)
     if (isa == DIST_ISA_SSE2) return 1;
     if (isa == DIST_ISA_AVX2) return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
     if (isa == DIST_ISA_AVX512)
-        return __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx512dq") &&
-               __builtin_cpu_supports("avx512vl");
+        return __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
+               __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl");
     return 0;
 #elif defined(__aarch64__)
     return isa == DIST_ISA_NEON;
@@ -574,8 +577,8 @@ TEST_UNUSED static void test_begin(int argc, char **argv)
         dist_context *ctx = test_context();
         if (dist_context_status(ctx) != DIST_OK || dist_context_isa(ctx) != isa) {
             test_state.failed++;
-            printf("not ok %s: the library refuses this processor's %s: %s\n", test_state.program, getenv("DIST_TEST_ISA"),
-                   ctx ? dist_context_message(ctx) : "(no context)");
+            printf("not ok %s: the library refuses this processor's %s: %s\n", test_state.program,
+                   getenv("DIST_TEST_ISA"), ctx ? dist_context_message(ctx) : "(no context)");
             test_state.nothing_runs = 1;
         }
         dist_context_destroy(ctx);

@@ -1,0 +1,79 @@
+# dist.h needs no build. This makes the examples, the benchmarks and the tests; a C compiler and make are enough.
+#
+#   make                every examples/*.c, tools/*.c and bench/*.c as build/NAME
+#   make demo           the demonstration, into out/demo
+#   make test           all tests, in a few minutes; the last line is the sum
+#   make matrix         the tests under every compiler, option and instruction set that this machine has
+#   make matrix-quick   the part of it that every change must pass
+#   make bench          the benchmarks, csv
+#   make clean
+
+CC = cc
+CXX = c++
+CFLAGS = -O2
+DEMO_COMMAND = build/fit_depth --demo --out out/demo
+BENCH_COMMAND = for b in $(BENCHES); do ./$$b || exit 1; done
+
+STRICT = -std=c99 -Wall -Wextra -Wpedantic -Wconversion -Wsign-conversion -Wshadow -Wcast-qual -Wundef \
+         -Wdouble-promotion -Wmissing-prototypes -Werror
+# Where and how test programs are built; the matrix sets both.
+TEST_DIR = build
+TEST_FLAGS = $(STRICT)
+
+PROGRAMS = $(patsubst examples/%.c,build/%,$(wildcard examples/*.c)) $(patsubst tools/%.c,build/%,$(wildcard tools/*.c))
+BENCHES = $(patsubst bench/%.c,build/%,$(wildcard bench/*.c))
+TESTS = $(patsubst tests/%.c,$(TEST_DIR)/%,$(wildcard tests/test_*.c))
+
+# Programs use all cores where the compiler can; the tests do not, so that the plain path is what is tested.
+OPENMP = $(eval OPENMP := $(shell mkdir -p build && echo 'int main(void) { return 0; }' > build/probe.c && \
+         $(CC) -fopenmp build/probe.c -o build/probe 2>/dev/null && echo -fopenmp))$(OPENMP)
+# Pictures are written as PNG where stb_image_write.h is found, else as PPM.
+STB = -isystem build/stb/usr/include
+
+all: $(PROGRAMS) $(BENCHES)
+
+build/%: examples/%.c dist.h $(wildcard examples/*.h) | build/stb/done
+	$(CC) $(CFLAGS) $(STRICT) $(OPENMP) $(STB) $< -o $@ -lm
+
+build/%: tools/%.c dist.h $(wildcard examples/*.h tools/*.h) | build/stb/done
+	$(CC) $(CFLAGS) $(STRICT) $(OPENMP) $(STB) $< -o $@ -lm
+
+build/%: bench/%.c dist.h $(wildcard examples/*.h bench/*.h) | build/stb/done
+	$(CC) $(CFLAGS) $(STRICT) $(OPENMP) $(STB) $< -o $@ -lm
+
+$(TEST_DIR)/test_%: tests/test_%.c dist.h $(wildcard tests/*.h)
+	@mkdir -p $(TEST_DIR)
+	$(CC) $(CFLAGS) $(TEST_FLAGS) $< -o $@ -lm
+
+# Fetches Debian's package of the stb headers, without root and only if they are missing; a failure does no harm.
+build/stb/done:
+	@mkdir -p build/stb
+	@echo '#include <stb/stb_image_write.h>' | $(CC) -E - >/dev/null 2>&1 || (cd build/stb && \
+	 timeout 60 apt-get -o Acquire::Retries=0 download libstb-dev && dpkg-deb -x libstb-dev_*.deb .) >/dev/null 2>&1 || true
+	@touch $@
+
+demo: all
+	@mkdir -p out/demo
+	$(DEMO_COMMAND)
+
+bench: all
+	@$(BENCH_COMMAND)
+
+test-programs: $(TESTS)
+
+# Two at a time, whatever -j says; a program that does not build is counted as failed by the runner.
+test:
+	@mkdir -p build
+	@$(MAKE) -s -k -j2 --no-print-directory test-programs || true
+	@CC="$(CC)" CXX="$(CXX)" sh tests/run.sh -s
+
+matrix:
+	@sh tests/matrix.sh
+
+matrix-quick:
+	@sh tests/matrix.sh quick
+
+clean:
+	rm -rf build
+
+.PHONY: all demo test test-programs matrix matrix-quick bench clean

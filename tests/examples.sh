@@ -1,0 +1,24 @@
+#!/bin/sh
+# Every example compiles by itself, from the root, with nothing but the C compiler.
+. tests/script.sh
+
+found=
+for file in examples/*.c; do
+    [ -e "$file" ] || continue
+    found=1
+    name=$(basename "$file" .c)
+    expect "${name}_compiles_alone" $CC -O2 "$file" -lm -o "$work/$name"
+    expect "${name}_is_strict" $CC -std=c99 -O0 $warnings -Wmissing-prototypes -isystem build/stb/usr/include \
+        -c "$file" -o "$work/$name.o"
+    if have clang && [ "$CC" != clang ]; then
+        expect "${name}_is_strict_clang" clang -std=c99 -O0 $warnings -Wmissing-prototypes -isystem build/stb/usr/include \
+            -fsyntax-only "$file"
+    fi
+done
+for file in bench/*.c tools/*.c; do
+    [ -e "$file" ] || continue
+    name=$(basename "$file" .c)
+    expect "${name}_is_strict" $CC -std=c99 -O0 $warnings -Wmissing-prototypes -isystem build/stb/usr/include \
+        -c "$file" -o "$work/$name.o"
+done
+[ -n "$found" ] || skip examples "there are none"

@@ -1,0 +1,69 @@
+#!/bin/sh
+# Each switch of the table at the top of dist.h, alone and all together.
+. tests/script.sh
+
+sed -n '/^   Options/,/^$/p' dist.h | grep -o 'DIST_NO_[A-Z_]*' | sort -u >"$work/table"
+code dist.h | grep -o 'DIST_NO_[A-Z_]*' | sort -u >"$work/used"
+if [ ! -s "$work/table" ]; then
+    not_ok option_table "no DIST_NO_ switch found in it"
+    exit 1
+fi
+diff "$work/table" "$work/used" | grep '^[<>]' >"$work/difference"
+expect_nothing option_table_names_the_switches_in_use "$work/difference"
+
+# build NAME FLAGS...: a small program with all warnings, run.
+build() {
+    name=$1
+    shift
+    expect "$name" $CC -std=c99 -O0 $warnings -Wmissing-prototypes -DDIST_IMPLEMENTATION "$@" tests/small.c \
+        -o "$work/program" -lm || return 0
+    "$work/program" >"$work/answer" 2>&1 && ok "${name}_runs" || not_ok "${name}_runs" "$(head -n 1 "$work/answer")"
+}
+
+all=
+while read -r switch; do
+    build "$switch" "-D$switch"
+    all="$all -D$switch"
+done <"$work/table"
+build all_together $all
+build DIST_STATIC -DDIST_STATIC
+build DIST_STATIC_and_all $all -DDIST_STATIC
+build DIST_API '-DDIST_API=extern __attribute__((visibility("hidden")))'
+build DIST_ASSERT '-DDIST_ASSERT(x)=((x) ? (void)0 : __builtin_trap())'
+build NDEBUG -DNDEBUG
+for cc in clang; do
+    if have $cc; then
+        expect "all_together_$cc" $cc -std=c99 $warnings -Wmissing-prototypes -DSMALL_LIBRARY $all -c tests/small.c \
+            -o "$work/c.o"
+        expect "DIST_STATIC_$cc" $cc -std=c99 $warnings -Wmissing-prototypes -DDIST_IMPLEMENTATION -DDIST_STATIC \
+            -c tests/small.c -o "$work/c.o"
+    else
+        skip "all_together_$cc" "$cc is not installed"
+    fi
+done
+if have "$CXX"; then
+    expect all_together_cxx $CXX -x c++ -std=c++11 $warnings -DSMALL_LIBRARY $all -c tests/small.c -o "$work/c.o"
+    expect DIST_STATIC_cxx $CXX -x c++ -std=c++11 $warnings -DDIST_IMPLEMENTATION -DDIST_STATIC -c tests/small.c -o "$work/c.o"
+fi
+
+# What a switch promises to leave out, it does leave out.
+if ! have nm; then
+    skip left_out "nm is not installed"
+    exit 0
+fi
+# without SWITCH PATTERN: no undefined or own symbol matches.
+without() {
+    $CC -DSMALL_LIBRARY "-D$1" -c tests/small.c -o "$work/c.o" 2>/dev/null && nm "$work/c.o" >"$work/nm" ||
+        { not_ok "$1_leaves_out" "it does not compile"; return; }
+    grep -E " ($2)$" "$work/nm" >"$work/left"
+    expect_nothing "$1_leaves_out" "$work/left"
+}
+without DIST_NO_LIBC_ALLOC 'U (malloc|free|calloc|realloc|aligned_alloc|posix_memalign)'
+without DIST_NO_STDIO 'U (f(open|read|write|close|seek|tell|puts|putc|getc|gets|printf|flush)|std(in|out|err)|remove|rename)|. dist_[a-z_]*_(load_file|save_file|pfm_load|pfm_save)'
+without DIST_NO_BACKWARD '[Tt] dist_[a-z_]*backward|[Tt] dist_adam_step'
+without DIST_NO_TRAIN '[Tt] dist_net_(create|set_weights|set_code)'
+without DIST_NO_MESH '[Tt] dist_(mesh_[a-z]*|chamfer)'
+without DIST_NO_SIMD '[Tt] disti?_[a-z_0-9]*_(sse2|avx2|avx512|neon)'
+$CC -DDIST_IMPLEMENTATION -DDIST_STATIC -c tests/small.c -o "$work/c.o" 2>/dev/null
+nm "$work/c.o" 2>/dev/null | grep ' [TWV] dist' >"$work/left"
+expect_nothing DIST_STATIC_exports_nothing "$work/left"

@@ -1,7 +1,7 @@
 # dist.h needs no build. This makes the examples, the benchmarks and the tests; a C compiler and make are enough.
 #
 #   make                every examples/*.c, tools/*.c and bench/*.c as build/NAME
-#   make demo           the demonstration, into out/demo
+#   make demo           the demonstration: fits a shape to one depth picture, results in out/
 #   make test           all tests, in a few minutes; the last line is the sum
 #   make matrix         the tests under every compiler, option and instruction set that this machine has
 #   make matrix-quick   the part of it that every change must pass
@@ -52,8 +52,8 @@ build/stb/done:
 	 timeout 60 apt-get -o Acquire::Retries=0 download libstb-dev && dpkg-deb -x libstb-dev_*.deb .) >/dev/null 2>&1 || true
 	@touch $@
 
-demo: all
-	@mkdir -p out/demo
+demo: build/fit_depth
+	@mkdir -p out
 	$(DEMO_COMMAND)
 
 bench: all

@@ -103,7 +103,7 @@ TEST_UNUSED static void test_skip(const char *reason)
     printf("skip %s: %s\n", test_state.current ? test_state.current : test_state.program, reason);
 }
 
-/* Prints the sum as the last line; main returns it. To have run nothing, by a filter that fits no test, is a failure. */
+/* Prints the sum as the last line; main returns it. To have run nothing, by a filter that fits none, is a failure. */
 TEST_UNUSED static int test_report(void)
 {
     if (test_state.matched == 0 && !test_state.nothing_runs) {

@@ -53,6 +53,7 @@ knows_not() {
     for number in $1; do
         from=$(awk -v n="$number" '$2 == n { print $1 }' "$work/sections")
         to=$(awk -v n="$number" '$2 > n { print $1 - 1; exit }' "$work/sections")
+        [ -n "$from" ] || { echo "section $number is missing" >>"$work/found"; continue; }
         awk -v from="$from" -v to="${to:-$total}" 'NR >= from && NR <= to { print NR ": " $0 }' "$work/code" |
             grep -E "$2" >>"$work/found"
     done

@@ -25,6 +25,14 @@ for cc in gcc clang; do
         -o "$work/c.o"
 done
 
+# The other processor.
+if have aarch64-linux-gnu-gcc; then
+    expect aarch64_c99 aarch64-linux-gnu-gcc -std=c99 -O2 $warnings -Wmissing-prototypes -DSMALL_LIBRARY -c tests/small.c \
+        -o "$work/c.o"
+else
+    skip aarch64_c99 "aarch64-linux-gnu-gcc is not installed"
+fi
+
 # The declarations alone, where no warning may come from either.
 for cc in $(compilers); do
     cxx=$(cxx_of "$cc")

@@ -7,6 +7,7 @@ if ! have nm; then
     exit 0
 fi
 
+nm=nm
 # object NAME COMPILER FLAGS...
 object() {
     name=$1
@@ -16,13 +17,13 @@ object() {
         not_ok "$name" "it does not compile: $(head -n 1 "$work/answer")"
         return
     fi
-    nm "$work/$name.o" | grep -E ' [bBdDCsSgG] ' | grep -v 'gomp_critical_user_dist_run' >"$work/$name.data"
+    $nm "$work/$name.o" | grep -E ' [bBdDCsSgG] ' | grep -v 'gomp_critical_user_dist_run' >"$work/$name.data"
     expect_nothing "no_data_$name" "$work/$name.data"
-    nm -g "$work/$name.o" | grep -v ' [UwV] ' | grep -v -E ' [TtRrC] (dist_[a-z0-9_]*|\.gomp_critical_user_dist_run.*)$' \
+    $nm -g "$work/$name.o" | grep -v ' [UwV] ' | grep -v -E ' [TtRrC] (dist_[a-z0-9_]*|\.gomp_critical_user_dist_run.*)$' \
         >"$work/$name.names"
     expect_nothing "only_dist_names_$name" "$work/$name.names"
     # What is asked of the system: mathematics, memory, strings, files.
-    nm -u "$work/$name.o" | awk '{ print $NF }' | grep -E -w \
+    $nm -u "$work/$name.o" | awk '{ print $NF }' | grep -E -w \
         '_*(printf|fprintf|puts|putchar|vprintf|perror|abort|exit|_exit|raise|signal|getenv|setenv|__errno_location|assert|__assert_fail|time|clock|rand|srand|setlocale|strtod|sscanf|atof|qsort)(_chk)?' \
         >"$work/$name.calls"
     expect_nothing "no_forbidden_calls_$name" "$work/$name.calls"
@@ -33,6 +34,13 @@ for cc in $(compilers); do
     object "${cc}_O2" "$cc" -std=c99 -O2 -fno-math-errno
 done
 object openmp $CC -std=c99 -O0 -fopenmp
+if have aarch64-linux-gnu-gcc && have aarch64-linux-gnu-nm; then
+    nm=aarch64-linux-gnu-nm
+    object aarch64 aarch64-linux-gnu-gcc -std=c99 -O2
+    nm=nm
+else
+    skip aarch64 "aarch64-linux-gnu-gcc is not installed"
+fi
 
 # Declared and defined are the same.
 code dist.h | sed '/DIST_IMPLEMENTATION/q' | tr '\n' ' ' | grep -o 'DIST_API [^;]*;' |

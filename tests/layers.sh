@@ -37,7 +37,10 @@ while read -r line number name; do
         open=$((open - 1))
     done
     test="sections_above_$number"
-    if ! $CC -std=c99 -O0 $keep -Werror=implicit-function-declaration -Wno-unused-function -DDIST_IMPLEMENTATION -x c \
+    # The kernels are seen once, with the section after them; without them it compiles three times as fast.
+    plain=-DDIST_NO_SIMD
+    [ "$number" = 04 ] && plain=
+    if ! $CC -std=c99 -O0 $plain $keep -Werror=implicit-function-declaration -Wno-unused-function -DDIST_IMPLEMENTATION -x c \
         -c "$work/cut.h" -o "$work/cut.o" 2>"$work/answer"; then
         not_ok "$test" "they do not compile alone: $(grep error "$work/answer" | head -n 1)"
         continue

@@ -28,22 +28,23 @@ done <"$work/table"
 build all_together $all
 build DIST_STATIC -DDIST_STATIC
 build DIST_STATIC_and_all $all -DDIST_STATIC
-build DIST_API '-DDIST_API=extern __attribute__((visibility("hidden")))'
+build DIST_API -DDIST_NO_SIMD '-DDIST_API=extern __attribute__((visibility("hidden")))'
 build DIST_ASSERT '-DDIST_ASSERT(x)=((x) ? (void)0 : __builtin_trap())'
-build NDEBUG -DNDEBUG
+build NDEBUG -DDIST_NO_SIMD -DNDEBUG
 for cc in clang; do
     if have $cc; then
         expect "all_together_$cc" $cc -std=c99 $warnings -Wmissing-prototypes -DSMALL_LIBRARY $all -c tests/small.c \
             -o "$work/c.o"
         expect "DIST_STATIC_$cc" $cc -std=c99 $warnings -Wmissing-prototypes -DDIST_IMPLEMENTATION -DDIST_STATIC \
-            -c tests/small.c -o "$work/c.o"
+            -DDIST_NO_SIMD -c tests/small.c -o "$work/c.o"
     else
         skip "all_together_$cc" "$cc is not installed"
     fi
 done
 if have "$CXX"; then
     expect all_together_cxx $CXX -x c++ -std=c++11 $warnings -DSMALL_LIBRARY $all -c tests/small.c -o "$work/c.o"
-    expect DIST_STATIC_cxx $CXX -x c++ -std=c++11 $warnings -DDIST_IMPLEMENTATION -DDIST_STATIC -c tests/small.c -o "$work/c.o"
+    expect DIST_STATIC_cxx $CXX -x c++ -std=c++11 $warnings -DDIST_IMPLEMENTATION -DDIST_STATIC -DDIST_NO_SIMD \
+        -c tests/small.c -o "$work/c.o"
 fi
 
 # What a switch promises to leave out, it does leave out.
@@ -53,7 +54,7 @@ if ! have nm; then
 fi
 # without SWITCH PATTERN: no undefined or own symbol matches.
 without() {
-    $CC -DSMALL_LIBRARY "-D$1" -c tests/small.c -o "$work/c.o" 2>/dev/null && nm "$work/c.o" >"$work/nm" ||
+    $CC -DSMALL_LIBRARY -DDIST_NO_SIMD "-D$1" -c tests/small.c -o "$work/c.o" 2>/dev/null && nm "$work/c.o" >"$work/nm" ||
         { not_ok "$1_leaves_out" "it does not compile"; return; }
     grep -E " ($2)$" "$work/nm" >"$work/left"
     expect_nothing "$1_leaves_out" "$work/left"
@@ -64,6 +65,6 @@ without DIST_NO_BACKWARD '[Tt] dist_[a-z_]*backward|[Tt] dist_adam_step'
 without DIST_NO_TRAIN '[Tt] dist_net_(create|set_weights|set_code)'
 without DIST_NO_MESH '[Tt] dist_(mesh_[a-z]*|chamfer)'
 without DIST_NO_SIMD '[Tt] disti?_[a-z_0-9]*_(sse2|avx2|avx512|neon)'
-$CC -DDIST_IMPLEMENTATION -DDIST_STATIC -c tests/small.c -o "$work/c.o" 2>/dev/null
+$CC -DDIST_IMPLEMENTATION -DDIST_STATIC -DDIST_NO_SIMD -c tests/small.c -o "$work/c.o" 2>/dev/null
 nm "$work/c.o" 2>/dev/null | grep ' [TWV] dist' >"$work/left"
 expect_nothing DIST_STATIC_exports_nothing "$work/left"

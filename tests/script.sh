@@ -24,8 +24,8 @@ expect() {
     if "$@" >"$work/answer" 2>&1; then
         ok "$expect_name"
     else
-        not_ok "$expect_name" "$(grep -e error -e warning -e undefined "$work/answer" | head -n 3 | tr '\n' '|')"
-        sed 's/^/    /' "$work/answer" | head -n 12
+        not_ok "$expect_name" "it ended with an error, which begins:"
+        { grep -e error -e warning -e undefined "$work/answer" || cat "$work/answer"; } | head -n 4 | sed 's/^/    /'
         return 1
     fi
 }

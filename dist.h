@@ -1,0 +1,8393 @@
+/* SPDX-License-Identifier: MIT-0
+   dist.h - differentiable sphere tracing of neural signed distance functions
+
+   What it is: a trained decoder f(p, z) -> signed distance goes in; depth, normals, silhouette and mask from any camera
+   come out; and a loss on those images goes back, by a hand-derived adjoint, to the code z, the camera and the weights.
+   The method is Liu et al., "DIST: Rendering Deep Implicit Signed Distance Function with Differentiable Sphere Tracing",
+   CVPR 2020; "the paper" below. One file, C99 and C++11, no dependency, no build flag.
+
+   What it does not: no GPU, no window, no general automatic differentiation, no path tracing; no 16-bit images.
+
+   How to use it:
+       #define DIST_IMPLEMENTATION                                            // in one file of your program
+       #include "dist.h"
+
+       dist_context *ctx    = dist_context_create(NULL);
+       dist_net     *net    = dist_net_load_file(ctx, "model.safetensors");
+       dist_shape   *shape  = dist_shape_create(ctx, net, dist_net_code(net, 0));
+       dist_field    field  = dist_shape_field(shape);
+       float eye[3] = {1.4f, 1.0f, 2.0f}, at[3] = {0, 0, 0}, up[3] = {0, 1, 0};
+       dist_camera   camera = dist_camera_look_at(W, H, 0.7f, eye, at, up);
+       dist_images   out; memset(&out, 0, sizeof out); out.depth = depth;     // what is NULL is not computed
+       dist_render(ctx, &field, &camera, NULL, &out, NULL);
+       if (dist_context_status(ctx) != DIST_OK) puts(dist_context_message(ctx));   // one check at the end is enough
+
+   Options, defined before the include:
+       DIST_IMPLEMENTATION    the functions themselves, in one file
+       DIST_STATIC            all functions static;  DIST_API  your own linkage
+       DIST_ASSERT(x)         default assert-like no-op; our own mistakes only, never yours
+       DIST_NO_SIMD           portable C only
+       DIST_NO_OPENMP         ignore the compiler's OpenMP flag
+       DIST_NO_STDIO          no files: memory only
+       DIST_NO_LIBC_ALLOC     no malloc: dist_context_desc.allocator is required
+       DIST_NO_BACKWARD       no gradients (implies DIST_NO_TRAIN)
+       DIST_NO_TRAIN          no weight gradients, no dist_net_create, no Adam
+       DIST_NO_MESH           no isosurface, no Chamfer
+       DIST_NO_PAPER          no DIST_TRACE_PAPER
+
+   Conventions: world to camera x_cam = R x + t, x right, y down, z forward; pixel centers at integers unless the camera
+   says otherwise; depth is z, distance is along the ray; images are (height, width[, channels]), top row first; points
+   are (n, 3); a zeroed _desc means the defaults and NULL means the same; gradients are added to, never written.
+
+   Contents:
+   @ 01 config, status, hooks   @ 02 context   @ 03 kernels   @ 04 field   @ 05 net   @ 06 camera
+   @ 07 trace   @ 08 render   @ 09 loss   @ 10 optimizer   @ 11 mesh, metrics   @ 12 files
+*/
+#ifndef DIST_H
+#define DIST_H
+
+#define DIST_VERSION_MAJOR 0
+#define DIST_VERSION_MINOR 1
+#define DIST_VERSION_PATCH 0
+
+#include <stddef.h>
+
+#ifdef DIST_NO_BACKWARD
+#ifndef DIST_NO_TRAIN
+#define DIST_NO_TRAIN
+#endif
+#endif
+
+#ifndef DIST_API
+#if defined(DIST_STATIC) && (defined(__GNUC__) || defined(__clang__))
+#define DIST_API static __attribute__((unused))
+#elif defined(DIST_STATIC)
+#define DIST_API static
+#else
+#define DIST_API extern
+#endif
+#endif
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* ---- 01 config, status, hooks ---------------------------------------------------------------------------------------- */
+
+typedef int dist_status;
+enum {
+    DIST_OK = 0,
+    DIST_BAD_ARGUMENT = -1,  /* the caller's: the sentence says which function, field, value and what would be right */
+    DIST_OUT_OF_MEMORY = -2, /* the allocator returned NULL, or a size does not fit size_t */
+    DIST_BAD_FILE = -3,      /* a model, image or mesh that does not parse */
+    DIST_UNSUPPORTED = -4,   /* well-formed, but not something this library does */
+    DIST_NOT_FINITE = -5,    /* NaN or infinity where a number is needed */
+    DIST_IO = -6             /* a file cannot be opened, read or written */
+};
+
+/* "0.1.0" */
+DIST_API const char *dist_version(void);
+
+/* Memory. alloc_fn returns `bytes` bytes aligned to `alignment` (a power of two, at most 64) or NULL; free_fn gets the
+   same pointer and size back, never NULL. Called only inside create, load and extract functions and destroy.
+   Either both functions or none; none: malloc and free. */
+typedef struct dist_allocator {
+    void *user;
+    void *(*alloc_fn)(void *user, size_t bytes, size_t alignment);
+    void (*free_fn)(void *user, void *pointer, size_t bytes);
+} dist_allocator;
+
+/* Parallelism. run_fn calls task_fn(arg, index, worker) once for every index in 0..count-1, in any order, and returns
+   when all are done. `worker` is 0..dist_context_desc.workers-1 and no two calls with one worker overlap.
+   task_fn never calls back into run_fn. NULL: OpenMP when the compiler has it on, else serial. */
+typedef void (*dist_task_fn)(void *arg, int index, int worker);
+typedef struct dist_scheduler {
+    void *user;
+    void (*run_fn)(void *user, int count, dist_task_fn task_fn, void *arg);
+} dist_scheduler;
+
+/* Matrix product of the user's BLAS: C (m, n) = alpha op(A) op(B) + beta C, all row-major, op(X) = X or its transpose;
+   lda, ldb, ldc are row strides in floats. Tried on a small product when the context is made; a wrong answer is refused.
+   It may be called from several workers at once. Used for layers at least dist_context_desc.blas_width wide. */
+typedef struct dist_blas {
+    void *user;
+    void (*sgemm_fn)(void *user, int transpose_a, int transpose_b, int m, int n, int k, float alpha, const float *a, int lda,
+                     const float *b, int ldb, float beta, float *c, int ldc);
+} dist_blas;
+
+/* Told every failure as it happens, with the sentence that dist_context_message keeps only for the first. */
+typedef struct dist_logger {
+    void *user;
+    void (*log_fn)(void *user, dist_status status, const char *message);
+} dist_logger;
+
+/* ---- 02 context ------------------------------------------------------------------------------------------------------- */
+
+/* Hooks in force, processor features, scratch memory, and the first failure with its sentence.
+   One context serves one thread at a time; contexts are independent of each other. */
+typedef struct dist_context dist_context;
+
+enum {
+    DIST_ISA_AUTO = 0, /* the best that this processor and this build have */
+    DIST_ISA_SCALAR,
+    DIST_ISA_SSE2,
+    DIST_ISA_AVX2,   /* with FMA */
+    DIST_ISA_AVX512, /* F, BW, DQ, VL */
+    DIST_ISA_NEON    /* AArch64 */
+};
+
+typedef struct dist_context_desc {
+    int workers; /* threads to use at most; 0: as many as OpenMP would, 1 without OpenMP. Required with a scheduler */
+    int isa;     /* DIST_ISA_*; one that the processor lacks is refused. Bits are the same on all machines for one isa */
+    dist_allocator allocator;
+    dist_scheduler scheduler;
+    dist_blas blas;
+    dist_logger logger;
+    int blas_width; /* 0: 128 */
+} dist_context_desc;
+
+/* desc may be NULL. Returns NULL only if memory cannot be had; any other failure (a refused hook) comes back as a context
+   whose status says so and with which every further call fails with that status. */
+DIST_API dist_context *dist_context_create(const dist_context_desc *desc);
+DIST_API void dist_context_destroy(dist_context *ctx);
+
+/* First failure since the context was made or cleared. A NULL context: DIST_BAD_ARGUMENT. */
+DIST_API dist_status dist_context_status(const dist_context *ctx);
+/* Its sentence; "" if there was none. Valid until the context is cleared or destroyed. */
+DIST_API const char *dist_context_message(const dist_context *ctx);
+DIST_API void dist_context_clear(dist_context *ctx);
+/* DIST_ISA_* in force, and its name: "scalar", "sse2", "avx2", "avx512", "neon". */
+DIST_API int dist_context_isa(const dist_context *ctx);
+DIST_API const char *dist_isa_name(int isa);
+DIST_API int dist_context_workers(const dist_context *ctx);
+
+/* ---- 04 field --------------------------------------------------------------------------------------------------------- */
+
+/* What is traced: a function of the point that is negative inside, positive outside, zero on the surface, within a
+   bounding sphere. Yours, an analytic one below, or a network (dist_shape_field). A plain value: copy it freely.
+   The callbacks must not call functions of this library with the same context. */
+typedef struct dist_field {
+    void *user;
+    /* sdf[i] = f(points[i]) for n points (n, 3); gradient (n, 3) is NULL or gets df/dpoint.
+       Called from several workers at once; worker is 0..dist_context_workers-1. */
+    void (*eval_fn)(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient);
+    /* d_code[j] += sum over i of d_sdf[i] * df(points[i])/dcode[j]. NULL: this field has no code. */
+    void (*adjoint_fn)(void *user, int worker, size_t n, const float *points, const float *d_sdf, double *d_code);
+    /* Set by dist_shape_field, NULL in a field of your own: value, gradient and code adjoint in one pass, and the weights'. */
+    void (*fused_fn)(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient,
+                     void (*seed_fn)(void *seed_user, size_t first, size_t count, const float *sdf, const float *gradient,
+                                     float *d_sdf),
+                     void *seed_user, double *d_code);
+    dist_status (*weights_fn)(void *user, dist_context *ctx, size_t n, const float *points, float *d_sdf,
+                              void (*seed_fn)(void *seed_user, size_t first, size_t count, const float *sdf,
+                                              const float *gradient, float *d_sdf),
+                              void *seed_user, float *d_points, double *d_code, float *d_weights);
+    /* color (n, 3) at n points. NULL: this field has no color. */
+    void (*color_fn)(void *user, int worker, size_t n, const float *points, float *color);
+    float center[3]; /* bounding sphere: the surface lies inside it, nothing is looked for outside */
+    float radius;
+    float lipschitz; /* bound or estimate of |grad f|; 0: 1 */
+    float clamp;     /* |f| above this carries no distance (a clamped training); 0: none */
+    int code_size;   /* length of d_code */
+    size_t weight_count;
+    dist_context *owner; /* the context that made it; NULL: any */
+} dist_field;
+
+/* f = distance to a sphere, to a torus around the y axis, to an axis-aligned box (half extents), exact; each within its
+   bounding sphere. Their code is the list of numbers given, in that order, so that gradients can be tried on them.
+   The arrays are borrowed while the field is used. */
+DIST_API dist_field dist_field_sphere(const float center_radius[4]);
+DIST_API dist_field dist_field_torus(const float center_radii[5]); /* x y z, ring radius, tube radius */
+DIST_API dist_field dist_field_box(const float center_half[6]);    /* x y z, half extents */
+
+/* Values and, unless NULL, gradients of any field at n points. */
+DIST_API dist_status dist_field_eval(dist_context *ctx, const dist_field *field, size_t n, const float *points /* (n,3) */,
+                                     float *sdf /* (n) */, float *gradient /* (n,3) or NULL */);
+
+#ifndef DIST_NO_BACKWARD
+/* Where gradients go; NULL is not wanted and costs nothing. All are added to.
+   rotation: tangent w of R' = exp([w]x) R; translation: of x_cam = R x + t. */
+typedef struct dist_gradients {
+    float *code;        /* (field.code_size) */
+    float *rotation;    /* (3) */
+    float *translation; /* (3) */
+    float *weights;     /* (field.weight_count), the order of dist_net_weights */
+} dist_gradients;
+
+/* Tells d_sdf (count) for points first..first+count-1 once their sdf (count) and gradient (count, 3) are known; gradient
+   is NULL where grads->weights is wanted. Called from several workers at once. */
+typedef void (*dist_seed_fn)(void *seed_user, size_t first, size_t count, const float *sdf, const float *gradient,
+                             float *d_sdf);
+
+/* Adjoint of dist_field_eval: with L = sum_i d_sdf[i] f(points[i]), adds dL/dcode and dL/dweights to grads and
+   d_sdf[i] * grad f(points[i]) to d_points (n, 3) unless NULL.
+   d_sdf (n): the weights, in; with seed_fn it is filled from it instead: then value and adjoint cost one pass together.
+   grads->rotation and ->translation must be NULL. */
+DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *field, size_t n, const float *points,
+                                         float *d_sdf, dist_seed_fn seed_fn, void *seed_user, float *d_points,
+                                         const dist_gradients *grads);
+#endif
+
+/* ---- 05 net ----------------------------------------------------------------------------------------------------------- */
+
+/* Weights of a decoder: read-only after creation, shared by any number of shapes and contexts. */
+typedef struct dist_net dist_net;
+/* Weights and one code, folded into the biases. Belongs to the context that made it. */
+typedef struct dist_shape dist_shape;
+
+enum {
+    DIST_ACTIVATION_RELU = 0,
+    DIST_ACTIVATION_ELU,
+    DIST_ACTIVATION_SOFTPLUS, /* log(1 + exp(beta x)) / beta */
+    DIST_ACTIVATION_SINE,     /* sin(omega x) */
+    DIST_ACTIVATION_TANH,
+    DIST_ACTIVATION_NONE
+};
+
+/* Reads a model in safetensors form; tensor names and metadata as the README's "Model files" says. The bytes are copied.
+   A file is hostile until proved otherwise: NULL and a sentence for anything that does not fit. */
+DIST_API dist_net *dist_net_load(dist_context *ctx, const void *bytes, size_t size);
+#ifndef DIST_NO_STDIO
+DIST_API dist_net *dist_net_load_file(dist_context *ctx, const char *path);
+DIST_API dist_status dist_net_save_file(dist_context *ctx, const dist_net *net, const char *path);
+#endif
+DIST_API void dist_net_destroy(dist_net *net);
+/* Writes what dist_net_load reads; the same net gives the same bytes. *size is set to the bytes needed; with buffer NULL
+   nothing else happens; too small a capacity is refused. Weight norm is folded: plain weights are written, in F32. */
+DIST_API dist_status dist_net_save(dist_context *ctx, const dist_net *net, void *buffer, size_t capacity, size_t *size);
+
+DIST_API int dist_net_code_size(const dist_net *net);  /* 0: no code */
+DIST_API int dist_net_code_count(const dist_net *net); /* codes stored in the file */
+DIST_API const float *dist_net_code(const dist_net *net, int index); /* NULL out of range; borrowed from the net */
+DIST_API int dist_net_channels(const dist_net *net);
+DIST_API float dist_net_bound(const dist_net *net);    /* radius of the sphere that holds the shape */
+/* Multiply-adds of one query with the code folded, and without folding. */
+DIST_API size_t dist_net_operations(const dist_net *net, int folded);
+
+/* All trainable numbers: for each layer its weight (out, in) as in the file, its bias (out), its norm's weight and bias. */
+DIST_API size_t dist_net_weight_count(const dist_net *net);
+DIST_API const float *dist_net_weights(const dist_net *net);
+
+#ifndef DIST_NO_TRAIN
+/* A new net with random weights, for training. Zero fields mean the defaults. */
+typedef struct dist_net_desc {
+    int layers;       /* hidden layers, 1 to 31; 0: 8 */
+    int width;        /* units of each, 1 to 4096; 0: 512 */
+    int skip;         /* linear layer 1..layers-1 that sees [x, input] again; 0: none */
+    int code_size;    /* 0: none */
+    int code_count;   /* codes stored beside the weights, zero at first */
+    int activation;   /* DIST_ACTIVATION_* */
+    float scale;      /* beta of softplus, omega of sine; 0: 100, 30 */
+    int output_linear;/* 0: tanh at the end, 1: nothing */
+    int geometric;    /* 1: starts near the distance to a sphere of half the bound (ReLU, softplus); 0: PyTorch's start */
+    float bound;      /* 0: 1 */
+    float clamp;      /* 0: 0.1 with a code, none without */
+    unsigned seed;
+} dist_net_desc;
+DIST_API dist_net *dist_net_create(dist_context *ctx, const dist_net_desc *desc);
+/* Replace all weights (dist_net_weight_count) or one stored code. The caller sees to it that no shape is in use by another
+   thread; shapes of this net see the change at their next dist_shape_set_code. */
+DIST_API dist_status dist_net_set_weights(dist_context *ctx, dist_net *net, const float *weights);
+DIST_API dist_status dist_net_set_code(dist_context *ctx, dist_net *net, int index, const float *code);
+#endif
+
+/* code (dist_net_code_size) is copied; NULL means zeros. The net is borrowed until the shape is destroyed. */
+DIST_API dist_shape *dist_shape_create(dist_context *ctx, const dist_net *net, const float *code);
+DIST_API void dist_shape_destroy(dist_shape *shape);
+DIST_API dist_status dist_shape_set_code(dist_shape *shape, const float *code);
+/* The field of the net's distance channel. Borrows the shape. A net without one (r,g,b) gives a field that render refuses. */
+DIST_API dist_field dist_shape_field(dist_shape *shape);
+/* All output channels (n, dist_net_channels) at n points. */
+DIST_API dist_status dist_shape_eval(dist_context *ctx, dist_shape *shape, size_t n, const float *points, float *channels);
+
+/* ---- 06 camera -------------------------------------------------------------------------------------------------------- */
+
+/* Pinhole camera. A world point x is seen at x_cam = rotation x + translation (row-major, x right, y down, z forward),
+   pixel u = fx X/Z + skew Y/Z + cx, v = fy Y/Z + cy. */
+typedef struct dist_camera {
+    float fx, fy, cx, cy, skew; /* pixels */
+    float rotation[9];
+    float translation[3];
+    int width, height;  /* 1 to 65536 */
+    float pixel_center; /* coordinate of the first pixel's center: 0 (OpenCV, the authors) or 0.5 (COLMAP, OpenGL) */
+} dist_camera;
+
+/* fx = fy = height / 2 / tan(fov_y / 2), cx = (width - 1) / 2, cy = (height - 1) / 2, pixel centers at integers.
+   Degenerate input (eye = at, up along the view) is repaired by choosing another up; what cannot be repaired is refused by
+   the function that takes the camera. */
+DIST_API dist_camera dist_camera_look_at(int width, int height, float fov_y /* radians */, const float eye[3],
+                                         const float at[3], const float up[3]);
+/* camera_to_world: row-major 3 x 4 or the upper part of 4 x 4, x right, y up, z backward (OpenGL, Blender, NeRF). */
+DIST_API void dist_camera_set_opengl(dist_camera *camera, const float camera_to_world[12]);
+DIST_API void dist_camera_get_opengl(const dist_camera *camera, float camera_to_world[12]);
+/* COLMAP's images.txt: quaternion w x y z and translation, world to camera; sets pixel_center to 0.5.
+   A zero quaternion is refused, another length normalized. */
+DIST_API dist_status dist_camera_set_colmap(dist_camera *camera, const float quaternion[4], const float translation[3]);
+DIST_API void dist_camera_get_colmap(const dist_camera *camera, float quaternion[4], float translation[3]);
+/* rotation <- exp([w]x) rotation, kept orthonormal; translation += t. The step for a gradient of dist_gradients. */
+DIST_API void dist_camera_move(dist_camera *camera, const float w[3], const float t[3]);
+/* Center of projection -R^T t and unit direction of pixel (x, y), in world coordinates. */
+DIST_API void dist_camera_ray(const dist_camera *camera, float x, float y, float origin[3], float direction[3]);
+
+/* ---- 07 trace --------------------------------------------------------------------------------------------------------- */
+
+enum { DIST_TRACE_GUARDED = 0, DIST_TRACE_PAPER = 1 };
+enum { DIST_PAPER_COARSE_TO_FINE = 0, DIST_PAPER_AGGRESSIVE, DIST_PAPER_DYNAMIC, DIST_PAPER_PARALLEL };
+enum { DIST_GRADIENT_AUTO = 0, DIST_GRADIENT_IMPLICIT, DIST_GRADIENT_NORMAL, DIST_GRADIENT_PAPER };
+enum { DIST_NORMAL_ANALYTIC = 0, DIST_NORMAL_DIFFERENCE = 1 };
+enum { DIST_SPACE_CAMERA = 0, DIST_SPACE_WORLD = 1 };
+enum { DIST_INSIDE_BACKGROUND = 0, DIST_INSIDE_HIT = 1, DIST_INSIDE_EXIT = 2 };
+
+enum {
+    DIST_RAY_MISS = 0,   /* nothing there */
+    DIST_RAY_HIT,        /* the distance is within its error bound */
+    DIST_RAY_UNRESOLVED, /* step budget spent: mask 0, distance of the sample of smallest |f| */
+    DIST_RAY_INSIDE,     /* started inside the solid: as how.inside says */
+    DIST_RAY_PLATEAU,    /* f is small and flat: no crossing within reach; mask 0 */
+    DIST_RAY_NOT_FINITE  /* the field gave NaN or infinity: mask 0 */
+};
+
+typedef struct dist_render_desc {
+    int max_steps;       /* queries per ray at most; 0: 100 guarded, 50 paper */
+    float step_scale;    /* alpha; 0: 1.5 (paper: rows aggressive and coarse-to-fine). Above 0 */
+    float epsilon;       /* largest |f| of a hit, shape units; 0: 5e-5, or less where a pixel is smaller (see the README) */
+    int samples;         /* K of the paper's gradient, 1 to 8; 0: 1 */
+    int trace;           /* DIST_TRACE_* */
+    int paper_row;       /* DIST_PAPER_* */
+    int gradient;        /* DIST_GRADIENT_*; AUTO: NORMAL with the guarded tracer, PAPER with the paper's */
+    float gradient_cap;  /* tau: |grad f . v| counts as at least tau |grad f|; 0: 0.1 */
+    int normal_mode;     /* DIST_NORMAL_* */
+    float normal_delta;  /* half step of differences, shape units; 0: 1e-3 of the bounding radius */
+    int normal_space;    /* DIST_SPACE_* */
+    int inside;          /* DIST_INSIDE_* */
+    float background;    /* depth and distance at a miss */
+    float background_color[3];
+    float lipschitz;     /* 0: the field's */
+    int no_cones;        /* 1: every ray marches from the bounding sphere by itself */
+} dist_render_desc;
+
+/* What will be used: every 0 replaced by its default. */
+DIST_API dist_render_desc dist_render_desc_resolve(const dist_render_desc *desc);
+
+typedef struct dist_stats {
+    unsigned long long rays;            /* asked for */
+    unsigned long long rays_in_sphere;  /* of them, those that meet the bounding sphere */
+    unsigned long long queries;         /* points at which f was evaluated, everything included */
+    unsigned long long cone_queries, march_queries, refine_queries, silhouette_queries, normal_queries; /* their parts */
+    unsigned long long hits, unresolved, inside, plateau, not_finite;
+    unsigned long long capped;          /* backward: rays whose grad f . v was capped */
+    unsigned long long backward_points; /* backward: points through the adjoint */
+    unsigned long long skipped;         /* backward: pixels with a zero upstream gradient */
+    double operations;                  /* multiply-adds a dense net would have done for the queries; 0 if the field is not a net */
+    double operations_done;             /* of them, those not left out as dead units */
+    float epsilon;                      /* the |f| in force, smallest over the picture */
+    float lipschitz;                    /* in force */
+    float error;                        /* largest error bound over the hits */
+} dist_stats;
+
+/* One free ray's result. Distances are along the unit direction. */
+typedef struct dist_hit {
+    float distance; /* of the hit, or of the sample of smallest |f| */
+    float error;    /* bound on the distance's error */
+    float sdf;      /* f there */
+    int status;     /* DIST_RAY_* */
+} dist_hit;
+
+/* Traces n rays (origins (n, 3), directions (n, 3) of any nonzero length) with the guarded tracer: picking, shadows,
+   collision. The first surface in front of each origin. */
+DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size_t n, const float *origins,
+                                const float *directions, const dist_render_desc *how, dist_hit *hits, dist_stats *stats);
+
+/* ---- 08 render -------------------------------------------------------------------------------------------------------- */
+
+/* Planes of width * height entries, top row first; NULL: not computed. As d_out of dist_render_backward the float planes
+   hold dL/d(plane) and are only read. */
+typedef struct dist_images {
+    float *depth;          /* z in camera space */
+    float *distance;       /* along the ray */
+    float *normal;         /* (h, w, 3), unit, outward; 0 at a miss */
+    float *silhouette;     /* min |f| along the ray - epsilon, signed: < 0 at a hit, > 0 at a miss */
+    float *color;          /* (h, w, 3) */
+    unsigned char *mask;   /* 1 hit, 0 not: the authority */
+    unsigned char *status; /* DIST_RAY_* */
+    float *error;          /* bound on the error of distance; 0 at a miss */
+    dist_stats *stats;
+} dist_images;
+
+/* Keeps what the gradient needs: one distance and one status a pixel, and the paper's K samples where asked for. */
+typedef struct dist_tape dist_tape;
+/* For pictures of exactly this camera's size and of this desc's trace, paper_row and samples. */
+DIST_API dist_tape *dist_tape_create(dist_context *ctx, const dist_camera *camera, const dist_render_desc *desc);
+DIST_API void dist_tape_destroy(dist_tape *tape);
+
+/* Traces one ray per pixel and fills the planes that are not NULL. desc and tape may be NULL.
+   The tape borrows what the field points to until its last dist_render_backward. No allocator call.
+   Rays that miss: mask 0, depth and distance desc->background, normal 0, silhouette > 0. */
+DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, const dist_camera *camera,
+                                 const dist_render_desc *desc, const dist_images *out, dist_tape *tape);
+
+#ifndef DIST_NO_BACKWARD
+/* Adjoint of the dist_render that filled the tape: reads d_out's depth, distance, normal, silhouette; adds to grads.
+   d_out->stats, if given, gets capped, backward_points and skipped added. No allocator call. */
+DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *tape, const dist_images *d_out,
+                                          const dist_gradients *grads);
+#endif
+
+/* ---- 09 loss ---------------------------------------------------------------------------------------------------------- */
+
+/* Each returns weight * loss and adds its gradient to the d_ array unless that is NULL. n: pixels. Means are over the
+   pixels that count; none: 0 and no gradient. Sums are kept in double.
+   A target counts where it is finite and 0 < target < 1e5; mask may be NULL: then every pixel is a hit. */
+
+/* mean |depth - target| over hit, observed pixels */
+DIST_API float dist_loss_depth(size_t n, const float *depth, const float *target, const unsigned char *mask, float weight,
+                               float *d_depth);
+/* mean -(normal . target) over hit pixels whose target normal (n, 3) is finite and not 0; the target is normalized */
+DIST_API float dist_loss_normal(size_t n, const float *normal, const float *target, const unsigned char *mask, float weight,
+                                float *d_normal);
+/* mean over all pixels of S_gt max(0, S) + (1 - S_gt) max(0, -S); S_gt = target[i] != 0                       (paper, eq. 8) */
+DIST_API float dist_loss_silhouette(size_t n, const float *silhouette, const unsigned char *target, float weight,
+                                    float *d_silhouette);
+/* mean |color - target| over hit pixels and channels */
+DIST_API float dist_loss_color(size_t n, const float *color, const float *target, const unsigned char *mask, float weight,
+                               float *d_color);
+/* |code|^2; n: its length */
+DIST_API float dist_loss_code(size_t n, const float *code, float weight, float *d_code);
+
+/* ---- 10 optimizer ----------------------------------------------------------------------------------------------------- */
+
+#ifndef DIST_NO_BACKWARD
+/* Adam. moments (2 n floats) is the caller's, zeroed before the first step. Zero fields mean the defaults. */
+typedef struct dist_adam {
+    float *moments;
+    float rate;    /* 0: 1e-2; negative: exactly no movement */
+    float beta1;   /* 0: 0.9 */
+    float beta2;   /* 0: 0.999 */
+    float epsilon; /* 0: 1e-8 */
+    int step;      /* steps taken so far */
+} dist_adam;
+/* x (n) moves against gradient (n). A gradient that is not finite leaves its number and moments as they were;
+   returns how many did. */
+DIST_API size_t dist_adam_step(dist_adam *adam, size_t n, float *x, const float *gradient);
+#endif
+
+/* ---- 11 mesh, metrics ------------------------------------------------------------------------------------------------- */
+
+#ifndef DIST_NO_MESH
+/* Triangles, counterclockwise seen from outside. Made by the functions below, ended by dist_mesh_destroy. */
+typedef struct dist_mesh {
+    float *vertices;     /* (vertex_count, 3) */
+    float *normals;      /* (vertex_count, 3), unit, outward; NULL if not asked for */
+    unsigned *triangles; /* (triangle_count, 3) */
+    size_t vertex_count;
+    size_t triangle_count;
+    struct dist_context *owner;
+    size_t vertex_capacity, triangle_capacity;
+} dist_mesh;
+
+typedef struct dist_mesh_desc {
+    int resolution; /* cells along each side of the cube around the bounding sphere, 2 to 2048; 0: 128 */
+    float level;    /* the isosurface f = level */
+    int no_skip;    /* 1: evaluate every cell, also those that the Lipschitz figure rules out */
+    int normals;    /* 1: also normals, one gradient query a vertex */
+    int refine;     /* Newton steps that move vertices onto the surface, 0 to 8 */
+} dist_mesh_desc;
+
+/* f = level within the field's bounding sphere's cube: closed unless the surface leaves the cube. An empty surface is a
+   mesh of no triangles, not an error. NULL on failure. */
+DIST_API dist_mesh *dist_mesh_extract(dist_context *ctx, const dist_field *field, const dist_mesh_desc *desc);
+/* Copies the arrays; an index out of range or a vertex that is not finite is refused. */
+DIST_API dist_mesh *dist_mesh_create(dist_context *ctx, size_t vertex_count, const float *vertices, size_t triangle_count,
+                                     const unsigned *triangles);
+DIST_API void dist_mesh_destroy(dist_mesh *mesh);
+#ifndef DIST_NO_BACKWARD
+/* Adjoint of extraction: a vertex moves by dv = -n df / |grad f|, so d_vertices (vertex_count, 3) reaches the field's code
+   and weights. grads->rotation and ->translation must be NULL. */
+DIST_API dist_status dist_mesh_backward(dist_context *ctx, const dist_field *field, const dist_mesh *mesh,
+                                        const float *d_vertices, const dist_gradients *grads);
+#endif
+
+/* n points (n, 3), uniform over the area, the same for the same seed. An empty mesh is refused. */
+DIST_API dist_status dist_mesh_sample(dist_context *ctx, const dist_mesh *mesh, unsigned seed, size_t n, float *points);
+
+/* Chamfer distance as DeepSDF defines it: mean over a of squared distance to the nearest of b, plus the same the other way.
+   a (n, 3), b (m, 3). one_way[0], [1] get the two parts unless NULL. Allocates. */
+DIST_API dist_status dist_chamfer(dist_context *ctx, size_t n, const float *a, size_t m, const float *b, double *chamfer,
+                                  double one_way[2]);
+#endif
+
+/* ---- 12 files --------------------------------------------------------------------------------------------------------- */
+
+/* PFM: channels 1 or 3, little-endian, bottom row first in the file, top row first in memory. */
+/* *size gets the bytes needed; buffer NULL: only that. */
+DIST_API dist_status dist_pfm_write(dist_context *ctx, int width, int height, int channels, const float *pixels, void *buffer,
+                                    size_t capacity, size_t *size);
+/* Reads the header; then, pixels not NULL, the picture into it (capacity in floats). Either byte order. */
+DIST_API dist_status dist_pfm_read(dist_context *ctx, const void *bytes, size_t size, int *width, int *height, int *channels,
+                                   float *pixels, size_t capacity);
+#ifndef DIST_NO_STDIO
+DIST_API dist_status dist_pfm_save(dist_context *ctx, const char *path, int width, int height, int channels,
+                                   const float *pixels);
+/* Loads into memory of the context's allocator; give it back with dist_pfm_free. */
+DIST_API float *dist_pfm_load(dist_context *ctx, const char *path, int *width, int *height, int *channels);
+#endif
+DIST_API void dist_pfm_free(dist_context *ctx, float *pixels, int width, int height, int channels);
+
+#ifndef DIST_NO_MESH
+/* Mesh files in memory. read: PLY (ascii, binary little-endian; triangles and polygons), OBJ (v, f; polygons fanned), OFF;
+   told apart by their first bytes. write: PLY binary, or OBJ. */
+enum { DIST_MESH_PLY = 0, DIST_MESH_OBJ = 1 };
+DIST_API dist_mesh *dist_mesh_read(dist_context *ctx, const void *bytes, size_t size);
+DIST_API dist_status dist_mesh_write(dist_context *ctx, const dist_mesh *mesh, int format, void *buffer, size_t capacity,
+                                     size_t *size);
+#ifndef DIST_NO_STDIO
+DIST_API dist_mesh *dist_mesh_load(dist_context *ctx, const char *path);
+/* By the name's ending: .ply or .obj. */
+DIST_API dist_status dist_mesh_save(dist_context *ctx, const dist_mesh *mesh, const char *path);
+#endif
+#endif
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif /* DIST_H */
+
+/* ======================================================================================================================== */
+/* End of the interface. You can stop reading here.                                                                         */
+/* ======================================================================================================================== */
+
+#ifdef DIST_IMPLEMENTATION
+#ifndef DIST_IMPLEMENTED
+#define DIST_IMPLEMENTED
+
+#include <math.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+#ifndef DIST_NO_STDIO
+#include <stdio.h>
+#endif
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/*@ 01 config, status, hooks ----------------------------------------------------------------------------------------------- */
+
+#ifndef DIST_ASSERT
+#define DIST_ASSERT(x) ((void)0)
+#endif
+
+#if defined(__GNUC__) || defined(__clang__)
+#define DISTI_RESTRICT __restrict__
+#define DISTI_TARGET(isa) __attribute__((target(isa)))
+#define DISTI_UNUSED __attribute__((unused))
+#elif defined(_MSC_VER)
+#define DISTI_RESTRICT __restrict
+#define DISTI_TARGET(isa)
+#define DISTI_UNUSED
+#else
+#define DISTI_RESTRICT
+#define DISTI_TARGET(isa)
+#define DISTI_UNUSED
+#endif
+/* gcc without optimization makes intrinsics twenty times slower; kernels ask for it themselves. */
+#if defined(__GNUC__) && !defined(__clang__) && !defined(__OPTIMIZE__)
+#define DISTI_KERNEL __attribute__((optimize("O2")))
+#else
+#define DISTI_KERNEL
+#endif
+
+#if !defined(DIST_NO_SIMD) && (defined(__x86_64__) || defined(_M_X64)) && (defined(__GNUC__) || defined(__clang__) || defined(_MSC_VER))
+#define DISTI_X86
+#include <immintrin.h>
+#ifdef _MSC_VER
+#include <intrin.h>
+#endif
+#endif
+#if !defined(DIST_NO_SIMD) && (defined(__aarch64__) || defined(_M_ARM64))
+#define DISTI_NEON
+#include <arm_neon.h>
+#endif
+#if defined(_OPENMP) && !defined(DIST_NO_OPENMP)
+#define DISTI_OPENMP
+#endif
+
+#define DISTI_ALIGNMENT 64
+#define DISTI_MIN(a, b) ((a) < (b) ? (a) : (b))
+#define DISTI_MAX(a, b) ((a) > (b) ? (a) : (b))
+
+DIST_API const char *dist_version(void)
+{
+    return "0.1.0";
+}
+
+/* Looks at the bits: -ffast-math removes a test of the value. */
+static int disti_finite(float x)
+{
+    uint32_t bits;
+    memcpy(&bits, &x, sizeof bits);
+    return (bits & 0x7f800000u) != 0x7f800000u;
+}
+
+DISTI_UNUSED static int disti_finite_all(size_t n, const float *x)
+{
+    for (size_t i = 0; i < n; i++)
+        if (!disti_finite(x[i])) return 0;
+    return 1;
+}
+
+DISTI_UNUSED static int disti_finite_double(double x)
+{
+    uint64_t bits;
+    memcpy(&bits, &x, sizeof bits);
+    return (bits & 0x7ff0000000000000u) != 0x7ff0000000000000u;
+}
+
+/* *out = a * b or a + b; returns 0 and leaves SIZE_MAX if that does not fit. */
+static int disti_size_mul(size_t a, size_t b, size_t *out)
+{
+    if (b != 0 && a > (size_t)-1 / b) {
+        *out = (size_t)-1;
+        return 0;
+    }
+    *out = a * b;
+    return 1;
+}
+
+static int disti_size_add(size_t a, size_t b, size_t *out)
+{
+    if (a > (size_t)-1 - b) {
+        *out = (size_t)-1;
+        return 0;
+    }
+    *out = a + b;
+    return 1;
+}
+
+#ifndef DIST_NO_LIBC_ALLOC
+/* malloc with alignment: the offset to the block's start stands in the byte before the pointer. */
+static void *disti_libc_alloc(void *user, size_t bytes, size_t alignment)
+{
+    (void)user;
+    size_t total;
+    if (!disti_size_add(bytes, alignment, &total)) return NULL;
+    unsigned char *block = (unsigned char *)malloc(total);
+    if (!block) return NULL;
+    size_t shift = alignment - ((uintptr_t)block & (alignment - 1)); /* 1 to 64 */
+    block[shift - 1] = (unsigned char)shift;
+    return block + shift;
+}
+
+static void disti_libc_free(void *user, void *pointer, size_t bytes)
+{
+    (void)user;
+    (void)bytes;
+    unsigned char *p = (unsigned char *)pointer;
+    free(p - p[-1]);
+}
+#endif
+
+/*@ 02 context ------------------------------------------------------------------------------------------------------------- */
+
+struct dist_context {
+    dist_allocator allocator;
+    dist_scheduler scheduler;
+    dist_blas blas;
+    dist_logger logger;
+    int blas_width;
+    int workers;
+    int isa;
+    dist_status status;
+    char message[400];
+    unsigned char *scratch; /* workers * scratch_bytes; grown by create functions only */
+    size_t scratch_bytes;   /* of each worker, a multiple of DISTI_ALIGNMENT */
+    double *partial;        /* DISTI_SLOTS * partial_size: sums of each slot, added in slot order */
+    size_t partial_size;
+};
+
+/* Each worker's scratch: counters, then the tracer's part, then the field's. */
+enum { DISTI_COUNTER_BYTES = 64, DISTI_TRACE_BYTES = 704 * 1024, DISTI_FIELD_OFFSET = DISTI_COUNTER_BYTES + DISTI_TRACE_BYTES };
+/* Sums that must not depend on the number of threads are kept in this many slots. */
+enum { DISTI_SLOTS = 32 };
+
+/* Multiply-adds of the field, for the report; each worker its own. */
+typedef struct disti_counter {
+    double dense; /* what a net without dead units does */
+    double done;
+} disti_counter;
+
+/* Appends a number as a person writes it: integers plainly, others with `digits` (at most 15) significant ones. */
+static size_t disti_format_number(char *out, double x, int digits)
+{
+    size_t n = 0;
+    uint64_t bits;
+    memcpy(&bits, &x, sizeof bits);
+    if (bits >> 63) {
+        out[n++] = '-';
+        x = -x;
+    }
+    if ((bits & 0x7ff0000000000000u) == 0x7ff0000000000000u) {
+        memcpy(out + n, (bits & 0xfffffffffffffu) ? "nan" : "inf", 3);
+        return n + 3;
+    }
+    int exponent = 0;
+    if (!(x < 1e15 && x == (double)(uint64_t)x)) {
+        double scale = 1.0;
+        while (x >= 10.0) x /= 10.0, exponent++;
+        while (x < 1.0) x *= 10.0, exponent--;
+        for (int i = 1; i < digits; i++) scale *= 10.0;
+        uint64_t mantissa = (uint64_t)(x * scale + 0.5);
+        if (mantissa >= (uint64_t)(scale * 10.0)) mantissa /= 10u, exponent++;
+        char text[16];
+        for (int i = digits - 1; i >= 0; i--) {
+            text[i] = (char)('0' + (int)(mantissa % 10u));
+            mantissa /= 10u;
+        }
+        int last = digits - 1;
+        while (last > 0 && text[last] == '0') last--;
+        int plain = exponent >= -4 && exponent < digits;
+        int point = plain ? exponent : 0; /* the digit after which the point stands */
+        for (int i = 0; i > point; i--) {
+            out[n++] = '0';
+            if (i == 0) out[n++] = '.';
+        }
+        for (int i = 0; i <= last || i <= point; i++) {
+            out[n++] = i <= last ? text[i] : '0';
+            if (i == point && i < last) out[n++] = '.';
+        }
+        if (plain || exponent == 0) return n;
+        out[n++] = 'e';
+        if (exponent < 0) out[n++] = '-';
+        x = exponent < 0 ? -exponent : exponent;
+    }
+    char reversed[24];
+    size_t count = 0;
+    uint64_t value = (uint64_t)x;
+    do {
+        reversed[count++] = (char)('0' + (int)(value % 10u));
+        value /= 10u;
+    } while (value);
+    while (count) out[n++] = reversed[--count];
+    return n;
+}
+
+/* Keeps the sentence of the first failure and returns status. In format %s stands for text, the first and second %d for a
+   and b; what is too long is cut. Unprintable bytes of text become '?': it may come out of a hostile file. */
+static dist_status disti_fail(dist_context *ctx, dist_status status, const char *format, const char *text, double a, double b)
+{
+    if (!ctx) return status;
+    char message[sizeof ctx->message];
+    size_t n = 0;
+    int used = 0;
+    for (const char *c = format; *c && n + 64 < sizeof message; c++) {
+        if (c[0] == '%' && c[1] == 's') {
+            for (const char *t = text ? text : "(null)"; *t && n + 64 < sizeof message; t++)
+                message[n++] = *t >= ' ' && *t <= '~' ? *t : '?';
+            c++;
+        } else if (c[0] == '%' && c[1] == 'd') {
+            n += disti_format_number(message + n, used++ ? b : a, 6);
+            c++;
+        } else {
+            message[n++] = *c;
+        }
+    }
+    message[n] = 0;
+    if (ctx->status == DIST_OK) {
+        ctx->status = status;
+        memcpy(ctx->message, message, n + 1);
+    }
+    if (ctx->logger.log_fn) ctx->logger.log_fn(ctx->logger.user, status, message);
+    return status;
+}
+
+/* NULL, after disti_fail, where the allocator refuses or bytes is SIZE_MAX (the mark of an overflow). */
+static void *disti_alloc(dist_context *ctx, size_t bytes)
+{
+    if (bytes == 0) bytes = DISTI_ALIGNMENT;
+    void *p = bytes == (size_t)-1 ? NULL : ctx->allocator.alloc_fn(ctx->allocator.user, bytes, DISTI_ALIGNMENT);
+    if (!p) disti_fail(ctx, DIST_OUT_OF_MEMORY, "out of memory: %d bytes were asked for", NULL, (double)bytes, 0);
+    return p;
+}
+
+/* bytes as given to disti_alloc; p may be NULL. */
+static void disti_free(dist_context *ctx, void *p, size_t bytes)
+{
+    if (p) ctx->allocator.free_fn(ctx->allocator.user, p, bytes == 0 ? (size_t)DISTI_ALIGNMENT : bytes);
+}
+
+#ifdef DISTI_X86
+/* r: eax, ebx, ecx, edx */
+static void disti_cpuid(unsigned leaf, unsigned r[4])
+{
+#ifdef _MSC_VER
+    int v[4];
+    __cpuidex(v, (int)leaf, 0);
+    for (int i = 0; i < 4; i++) r[i] = (unsigned)v[i];
+#else
+    __asm__ volatile("cpuid" : "=a"(r[0]), "=b"(r[1]), "=c"(r[2]), "=d"(r[3]) : "a"(leaf), "c"(0u));
+#endif
+}
+
+/* The registers that the operating system saves: bits 1 and 2 for ymm, 5 to 7 for zmm and the masks. */
+static unsigned disti_xgetbv(void)
+{
+#ifdef _MSC_VER
+    return (unsigned)_xgetbv(0);
+#else
+    unsigned low, high;
+    __asm__ volatile("xgetbv" : "=a"(low), "=d"(high) : "c"(0u));
+    return low;
+#endif
+}
+#endif
+
+/* Whether this processor, its operating system and this build have DIST_ISA_*. */
+static int disti_cpu_has(int isa)
+{
+    if (isa == DIST_ISA_SCALAR) return 1;
+#ifdef DISTI_NEON
+    if (isa == DIST_ISA_NEON) return 1;
+#endif
+#ifdef DISTI_X86
+    if (isa == DIST_ISA_SSE2) return 1; /* every x86-64 */
+    if (isa == DIST_ISA_AVX2 || isa == DIST_ISA_AVX512) {
+        const unsigned fma_osxsave_avx = 1u << 12 | 1u << 27 | 1u << 28;
+        const unsigned avx2 = 1u << 5;
+        const unsigned avx512 = avx2 | 1u << 16 | 1u << 17 | 1u << 30 | 1u << 31; /* F, DQ, BW, VL */
+        const unsigned features = isa == DIST_ISA_AVX2 ? avx2 : avx512;
+        const unsigned state = isa == DIST_ISA_AVX2 ? 0x06u : 0xe6u;
+        unsigned r[4];
+        disti_cpuid(0, r);
+        if (r[0] < 7) return 0;
+        disti_cpuid(1, r);
+        if ((r[2] & fma_osxsave_avx) != fma_osxsave_avx) return 0; /* without OSXSAVE xgetbv itself would fault */
+        if ((disti_xgetbv() & state) != state) return 0;
+        disti_cpuid(7, r);
+        return (r[1] & features) == features;
+    }
+#endif
+    return 0;
+}
+
+static int disti_cpu_best(void)
+{
+    if (disti_cpu_has(DIST_ISA_AVX512)) return DIST_ISA_AVX512;
+    if (disti_cpu_has(DIST_ISA_AVX2)) return DIST_ISA_AVX2;
+    if (disti_cpu_has(DIST_ISA_SSE2)) return DIST_ISA_SSE2;
+    return disti_cpu_has(DIST_ISA_NEON) ? DIST_ISA_NEON : DIST_ISA_SCALAR;
+}
+
+DIST_API const char *dist_isa_name(int isa)
+{
+    switch (isa) {
+    case DIST_ISA_SCALAR: return "scalar";
+    case DIST_ISA_SSE2: return "sse2";
+    case DIST_ISA_AVX2: return "avx2";
+    case DIST_ISA_AVX512: return "avx512";
+    case DIST_ISA_NEON: return "neon";
+    }
+    return "auto";
+}
+
+#if defined(DISTI_X86)
+/* The caller's floating-point state may trap, round elsewhere or flush; work runs in the default state with denormals
+   flushed (they cost a hundred times a normal number and carry nothing here), and the caller's comes back after it. */
+static unsigned disti_float_state_enter(void)
+{
+    unsigned state = _mm_getcsr();
+    _mm_setcsr(0x9fc0u); /* all exceptions masked, round to nearest, flush to zero, denormals are zero */
+    return state;
+}
+
+static void disti_float_state_leave(unsigned state)
+{
+    _mm_setcsr(state);
+}
+#elif defined(DISTI_NEON) && (defined(__GNUC__) || defined(__clang__))
+static unsigned disti_float_state_enter(void)
+{
+    uint64_t state;
+    uint64_t ours = 1u << 24; /* flush to zero, round to nearest, no traps */
+    __asm__ volatile("mrs %0, fpcr" : "=r"(state));
+    __asm__ volatile("msr fpcr, %0" : : "r"(ours));
+    return (unsigned)state;
+}
+
+static void disti_float_state_leave(unsigned state)
+{
+    uint64_t theirs = state;
+    __asm__ volatile("msr fpcr, %0" : : "r"(theirs));
+}
+#else
+static unsigned disti_float_state_enter(void) { return 0; }
+static void disti_float_state_leave(unsigned state) { (void)state; }
+#endif
+
+typedef struct disti_job {
+    dist_task_fn fn;
+    void *arg;
+} disti_job;
+
+static void disti_job_task(void *arg, int index, int worker)
+{
+    const disti_job *job = (const disti_job *)arg;
+    unsigned state = disti_float_state_enter();
+    job->fn(job->arg, index, worker);
+    disti_float_state_leave(state);
+}
+
+/* The only door to parallelism: fn(arg, index, worker) for index 0..count-1, worker below ctx->workers. */
+static void disti_run(dist_context *ctx, int count, dist_task_fn fn, void *arg)
+{
+    disti_job job;
+    job.fn = fn;
+    job.arg = arg;
+    if (ctx->scheduler.run_fn) {
+        ctx->scheduler.run_fn(ctx->scheduler.user, count, disti_job_task, &job);
+        return;
+    }
+#ifdef DISTI_OPENMP
+    if (ctx->workers > 1 && count > 1) {
+        int next = 0, team = 0;
+#pragma omp parallel num_threads(ctx->workers)
+        {
+            int worker, index;
+#pragma omp critical(dist_run)
+            worker = team++;
+            for (;;) {
+#pragma omp critical(dist_run)
+                index = next++;
+                if (index >= count) break;
+                disti_job_task(&job, index, worker);
+            }
+        }
+        return;
+    }
+#endif
+    for (int index = 0; index < count; index++) disti_job_task(&job, index, 0);
+}
+
+static int disti_default_workers(void)
+{
+    int team = 1;
+#ifdef DISTI_OPENMP
+    team = 0;
+#pragma omp parallel
+    {
+#pragma omp critical(dist_run)
+        team++;
+    }
+#endif
+    return team;
+}
+
+/* At the door of every public function that takes a context. A context that could not be made refuses everything. */
+static dist_status disti_enter(const dist_context *ctx, const char *function)
+{
+    (void)function;
+    if (!ctx) return DIST_BAD_ARGUMENT;
+    return ctx->workers > 0 ? DIST_OK : ctx->status;
+}
+
+/* Makes each worker's scratch at least `bytes`. The contents do not survive: create functions only. */
+static dist_status disti_scratch_reserve(dist_context *ctx, size_t bytes)
+{
+    size_t each, total;
+    if (bytes <= ctx->scratch_bytes) return DIST_OK;
+    disti_size_add(bytes, DISTI_ALIGNMENT - 1, &each);
+    each &= ~(size_t)(DISTI_ALIGNMENT - 1);
+    if (!disti_size_mul(each, (size_t)ctx->workers, &total)) total = (size_t)-1;
+    unsigned char *scratch = (unsigned char *)disti_alloc(ctx, total);
+    if (!scratch) return DIST_OUT_OF_MEMORY;
+    disti_free(ctx, ctx->scratch, ctx->scratch_bytes * (size_t)ctx->workers);
+    ctx->scratch = scratch;
+    ctx->scratch_bytes = each;
+    return DIST_OK;
+}
+
+static unsigned char *disti_scratch(const dist_context *ctx, int worker)
+{
+    return ctx->scratch + ctx->scratch_bytes * (size_t)worker;
+}
+
+static disti_counter *disti_counter_of(const dist_context *ctx, int worker)
+{
+    return (disti_counter *)(void *)disti_scratch(ctx, worker);
+}
+
+static dist_status disti_partial_reserve(dist_context *ctx, size_t size)
+{
+    size_t bytes;
+    if (size <= ctx->partial_size) return DIST_OK;
+    if (!disti_size_mul(size, DISTI_SLOTS * sizeof(double), &bytes)) bytes = (size_t)-1;
+    double *partial = (double *)disti_alloc(ctx, bytes);
+    if (!partial) return DIST_OUT_OF_MEMORY;
+    disti_free(ctx, ctx->partial, ctx->partial_size * DISTI_SLOTS * sizeof(double));
+    ctx->partial = partial;
+    ctx->partial_size = size;
+    return DIST_OK;
+}
+
+/* C (3, 4) = 2 A B + 3 C in all four transpositions, against plain loops; small integers, so every right BLAS is exact. */
+static int disti_blas_works(const dist_blas *blas)
+{
+    for (int mode = 0; mode < 4; mode++) {
+        float a[5 * 7], b[5 * 7], c[3 * 6], expected[3 * 6];
+        int ta = mode & 1, tb = mode >> 1;
+        for (int i = 0; i < 35; i++) {
+            a[i] = (float)((i * 7 + 3) % 11 - 5);
+            b[i] = (float)((i * 5 + 1) % 13 - 6);
+        }
+        for (int i = 0; i < 18; i++) c[i] = expected[i] = (float)(i % 4);
+        for (int i = 0; i < 3; i++) {
+            for (int j = 0; j < 4; j++) {
+                float sum = 0.0f;
+                for (int k = 0; k < 5; k++) sum += (ta ? a[k * 7 + i] : a[i * 7 + k]) * (tb ? b[j * 7 + k] : b[k * 7 + j]);
+                expected[i * 6 + j] = 2.0f * sum + 3.0f * expected[i * 6 + j];
+            }
+        }
+        blas->sgemm_fn(blas->user, ta, tb, 3, 4, 5, 2.0f, a, 7, b, 7, 3.0f, c, 6);
+        if (memcmp(c, expected, sizeof c) != 0) return 0;
+    }
+    return 1;
+}
+
+/* What is wrong with desc, as a status with its sentence. */
+static dist_status disti_context_check(dist_context *ctx, const dist_context_desc *desc)
+{
+    const char *name = "dist_context_create";
+    if (desc->workers < 0 || desc->workers > 1024)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: workers is %d, must be 0 to 1024", name, desc->workers, 0);
+    if (desc->isa < DIST_ISA_AUTO || desc->isa > DIST_ISA_NEON)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: isa is %d, must be a DIST_ISA_ constant", name, desc->isa, 0);
+    if (desc->isa != DIST_ISA_AUTO && !disti_cpu_has(desc->isa))
+        return disti_fail(ctx, DIST_UNSUPPORTED, "dist_context_create: this processor or this build has no %s",
+                          dist_isa_name(desc->isa), 0, 0);
+    if (desc->scheduler.run_fn && desc->workers == 0)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: workers is 0, must be told with a scheduler", name, 0, 0);
+    if (desc->blas_width < 0)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: blas_width is %d, must not be negative", name, desc->blas_width, 0);
+    if (desc->blas.sgemm_fn && !disti_blas_works(&desc->blas))
+        return disti_fail(ctx, DIST_BAD_ARGUMENT,
+                          "%s: blas.sgemm_fn fails its self-test: C = alpha op(A) op(B) + beta C, row-major, gives wrong numbers",
+                          name, 0, 0);
+    return DIST_OK;
+}
+
+DIST_API dist_context *dist_context_create(const dist_context_desc *desc)
+{
+    dist_context_desc d;
+    dist_allocator allocator;
+    memset(&d, 0, sizeof d);
+    if (desc) d = *desc;
+    allocator = d.allocator;
+    if (!allocator.alloc_fn != !allocator.free_fn) return NULL;
+    if (!allocator.alloc_fn) {
+#ifdef DIST_NO_LIBC_ALLOC
+        return NULL;
+#else
+        allocator.alloc_fn = disti_libc_alloc;
+        allocator.free_fn = disti_libc_free;
+#endif
+    }
+    dist_context *ctx = (dist_context *)allocator.alloc_fn(allocator.user, sizeof(dist_context), DISTI_ALIGNMENT);
+    if (!ctx) return NULL;
+    memset(ctx, 0, sizeof *ctx);
+    ctx->allocator = allocator;
+    ctx->logger = d.logger;
+    if (disti_context_check(ctx, &d) != DIST_OK) return ctx;
+    ctx->scheduler = d.scheduler;
+    ctx->blas = d.blas;
+    ctx->blas_width = d.blas_width > 0 ? d.blas_width : 128;
+    ctx->isa = d.isa == DIST_ISA_AUTO ? disti_cpu_best() : d.isa;
+    ctx->workers = d.workers > 0 ? d.workers : disti_default_workers();
+#ifndef DISTI_OPENMP
+    if (!ctx->scheduler.run_fn) ctx->workers = 1;
+#endif
+    if (disti_scratch_reserve(ctx, DISTI_FIELD_OFFSET) != DIST_OK) {
+        disti_free(ctx, ctx, sizeof *ctx);
+        return NULL;
+    }
+    return ctx;
+}
+
+DIST_API void dist_context_destroy(dist_context *ctx)
+{
+    if (!ctx) return;
+    disti_free(ctx, ctx->partial, ctx->partial_size * DISTI_SLOTS * sizeof(double));
+    disti_free(ctx, ctx->scratch, ctx->scratch_bytes * (size_t)ctx->workers);
+    disti_free(ctx, ctx, sizeof *ctx);
+}
+
+DIST_API dist_status dist_context_status(const dist_context *ctx)
+{
+    return ctx ? ctx->status : DIST_BAD_ARGUMENT;
+}
+
+DIST_API const char *dist_context_message(const dist_context *ctx)
+{
+    return ctx ? ctx->message : "no context: dist_context_create returned NULL";
+}
+
+DIST_API void dist_context_clear(dist_context *ctx)
+{
+    if (!ctx || ctx->workers == 0) return;
+    ctx->status = DIST_OK;
+    ctx->message[0] = 0;
+}
+
+DIST_API int dist_context_isa(const dist_context *ctx)
+{
+    return ctx ? ctx->isa : DIST_ISA_AUTO;
+}
+
+DIST_API int dist_context_workers(const dist_context *ctx)
+{
+    return ctx ? ctx->workers : 0;
+}
+
+/*@ 03 kernels ------------------------------------------------------------------------------------------------------------- */
+
+/* Points stand in the lanes: activations of a block of DISTI_BLOCK points are rows [unit][DISTI_BLOCK], and a layer's
+   weights are packed in panels of eight outputs, element (o, k) at ((o / 8) * rows + k) * 8 + o % 8, so that one broadcast
+   serves a whole row. Nothing is ever transposed on the way forward; the reverse pass reads the same packing. */
+enum { DISTI_BLOCK = 48 };
+
+/* forward   y[o][c] = bias[o] + sum_k weights(o, k) x[k][c]        k ascending over alive[0..alive_count-1], or all rows
+             with mask: y = max(0, y) and bit c of mask[o] = y[o][c] > 0
+   Leaving out rows that are zero for the whole block changes no bit of the result.
+   All matrices are 64-byte aligned; y, bias and mask hold `out` rounded up to a multiple of 8; columns beyond `columns`
+   may be computed from what stands there, up to DISTI_BLOCK, but their mask bits are 0. */
+typedef struct disti_gemm {
+    const float *weights;
+    const float *bias;
+    const float *x;
+    float *y;
+    const int *alive; /* NULL: all rows */
+    uint64_t *mask;   /* NULL: no ReLU */
+    int rows, alive_count, out, columns;
+} disti_gemm;
+
+/* backward  d_x[k][c] = (bit c of mask[k]) * sum_o weights(o, k) d_y[o][c]     o ascending over alive_out, k over alive_rows
+   NULL lists: all; NULL mask: all ones. Rows of d_x that are not listed are not written. */
+typedef struct disti_gemm_back {
+    const float *weights;
+    const float *d_y;
+    float *d_x;
+    const int *alive_out, *alive_rows;
+    const uint64_t *mask;
+    int rows, out, alive_out_count, alive_rows_count, columns;
+} disti_gemm_back;
+
+/* weights   d_weights[o * stride + k] += sum_c d_y[o][c] xt[c * xt_stride + k]      o < out, k < rows, c < columns
+   xt is the block's input transposed, (columns, xt_stride), xt_stride a multiple of 16; d_weights has no alignment. */
+typedef struct disti_gemm_weights {
+    const float *d_y;
+    const float *xt;
+    float *d_weights;
+    size_t stride, xt_stride;
+    int out, rows, columns;
+} disti_gemm_weights;
+
+typedef struct disti_kernels {
+    void (*gemm)(const disti_gemm *g);
+    void (*gemm_back)(const disti_gemm_back *g);
+    void (*gemm_weights)(const disti_gemm_weights *g);
+    /* y[c] = bias + sum_k w[k] x[k][c], c < DISTI_BLOCK, over alive rows (NULL: all): the last layer's single output */
+    void (*dot)(const float *w, float bias, const float *x, const int *alive, int alive_count, int rows, int columns, float *y);
+    /* y[k][c] = (bit c of mask[k]) * w[k] s[c] for the listed rows (NULL: all): its adjoint */
+    void (*outer)(const float *w, const float *s, const int *alive, int alive_count, int rows, int columns,
+                  const uint64_t *mask, float *y);
+} disti_kernels;
+
+/* The scalar kernels are the definition; the others are measured against them. */
+static void disti_gemm_scalar(const disti_gemm *g)
+{
+    const int count = g->alive ? g->alive_count : g->rows;
+    for (int o = 0; o < (g->out + 7) / 8 * 8; o++) {
+        const float *w = g->weights + (size_t)(o / 8) * (size_t)g->rows * 8 + o % 8;
+        float *y = g->y + (size_t)o * DISTI_BLOCK;
+        for (int c = 0; c < g->columns; c++) y[c] = g->bias[o];
+        for (int i = 0; i < count; i++) {
+            const size_t k = (size_t)(g->alive ? g->alive[i] : i);
+            const float *x = g->x + k * DISTI_BLOCK;
+            for (int c = 0; c < g->columns; c++) y[c] += w[k * 8] * x[c];
+        }
+        uint64_t bits = 0;
+        for (int c = 0; c < g->columns; c++) {
+            y[c] += 0.0f; /* minus zero becomes zero, so that a zero row left out cannot show in its sign */
+            if (!g->mask) continue;
+            if (y[c] > 0.0f) bits |= (uint64_t)1 << c;
+            else y[c] = 0.0f;
+        }
+        if (g->mask) g->mask[o] = bits;
+    }
+}
+
+static void disti_gemm_back_scalar(const disti_gemm_back *g)
+{
+    const int count = g->alive_rows ? g->alive_rows_count : g->rows;
+    const int out_count = g->alive_out ? g->alive_out_count : g->out;
+    for (int n = 0; n < count; n++) {
+        const size_t k = (size_t)(g->alive_rows ? g->alive_rows[n] : n);
+        float *d_x = g->d_x + k * DISTI_BLOCK;
+        for (int c = 0; c < g->columns; c++) d_x[c] = 0.0f;
+        for (int i = 0; i < out_count; i++) {
+            const size_t o = (size_t)(g->alive_out ? g->alive_out[i] : i);
+            const float w = g->weights[(o / 8 * (size_t)g->rows + k) * 8 + o % 8];
+            const float *d_y = g->d_y + o * DISTI_BLOCK;
+            for (int c = 0; c < g->columns; c++) d_x[c] += w * d_y[c];
+        }
+        if (!g->mask) continue;
+        for (int c = 0; c < g->columns; c++)
+            if (!(g->mask[k] >> c & 1)) d_x[c] = 0.0f;
+    }
+}
+
+static void disti_gemm_weights_scalar(const disti_gemm_weights *g)
+{
+    for (int o = 0; o < g->out; o++) {
+        const float *d_y = g->d_y + (size_t)o * DISTI_BLOCK;
+        float *d_weights = g->d_weights + (size_t)o * g->stride;
+        for (int k = 0; k < g->rows; k++) {
+            float sum = 0.0f;
+            for (int c = 0; c < g->columns; c++) sum += d_y[c] * g->xt[(size_t)c * g->xt_stride + (size_t)k];
+            d_weights[k] += sum;
+        }
+    }
+}
+
+static void disti_dot_scalar(const float *w, float bias, const float *x, const int *alive, int alive_count, int rows,
+                             int columns, float *y)
+{
+    const int count = alive ? alive_count : rows;
+    for (int c = 0; c < columns; c++) y[c] = bias;
+    for (int i = 0; i < count; i++) {
+        const size_t k = (size_t)(alive ? alive[i] : i);
+        for (int c = 0; c < columns; c++) y[c] += w[k] * x[k * DISTI_BLOCK + (size_t)c];
+    }
+    for (int c = 0; c < columns; c++) y[c] += 0.0f;
+}
+
+static void disti_outer_scalar(const float *w, const float *s, const int *alive, int alive_count, int rows, int columns,
+                               const uint64_t *mask, float *y)
+{
+    const int count = alive ? alive_count : rows;
+    for (int i = 0; i < count; i++) {
+        const size_t k = (size_t)(alive ? alive[i] : i);
+        for (int c = 0; c < columns; c++)
+            y[k * DISTI_BLOCK + (size_t)c] = mask && !(mask[k] >> c & 1) ? 0.0f : w[k] * s[c];
+    }
+}
+
+#if defined(DISTI_X86) || defined(DISTI_NEON)
+
+/* One text serves every instruction set. It is written in these words, which each set defines for itself:
+     DISTI_FUNCTION                     what stands before each of its functions
+     DISTI_VEC, DISTI_LANES             a vector, and how many floats it holds
+     DISTI_SET1(s) DISTI_LOAD(p) DISTI_STORE(p, v) DISTI_ADD(a, b) DISTI_FMA(a, b, c)    the last is a b + c
+     DISTI_RELU(v) DISTI_POSITIVE(v)    max(v, 0), and the bits of the lanes that are greater than 0
+     DISTI_KEEP(v, bits)                v with 0 where the lane's bit is 0
+     DISTI_DEPTH                        rows that one pass takes: 112 of 192 bytes stay in a first cache of 32 KiB, beside
+                                        the weights; wide vectors ask for less and keep up with the second cache
+   A tile of R rows and V vectors keeps its sums in variables a<row><vector>: gcc holds those in registers where it
+   would spill an array. A row's factor is broadcast and serves its V vectors; in the forward pass the factors of a
+   tile stand side by side, elsewhere at R offsets k<row>. */
+#ifdef _MSC_VER
+#define DISTI_NOINLINE __declspec(noinline)
+#else
+#define DISTI_NOINLINE __attribute__((noinline))
+#endif
+#define DISTI_X1(M, i) M(i, 0)
+#define DISTI_X2(M, i) M(i, 0) M(i, 1)
+#define DISTI_X3(M, i) M(i, 0) M(i, 1) M(i, 2)
+#define DISTI_Y1(M, V) M(0, V)
+#define DISTI_Y4(M, V) M(0, V) M(1, V) M(2, V) M(3, V)
+#define DISTI_Y8(M, V) M(0, V) M(1, V) M(2, V) M(3, V) M(4, V) M(5, V) M(6, V) M(7, V)
+
+#define DISTI_ZERO1(i, j) DISTI_VEC a##i##j = DISTI_SET1(0.0f);
+#define DISTI_BIAS1(i, j) a##i##j = DISTI_SET1(bias[i]);
+#define DISTI_AGAIN1(i, j) a##i##j = DISTI_LOAD(y + i * DISTI_BLOCK + j * DISTI_LANES);
+#define DISTI_ZERO(i, V) DISTI_X##V(DISTI_ZERO1, i)
+#define DISTI_BIAS(i, V) DISTI_X##V(DISTI_BIAS1, i)
+#define DISTI_AGAIN(i, V) DISTI_X##V(DISTI_AGAIN1, i)
+
+#define DISTI_INPUT(i, j) const DISTI_VEC x##j = DISTI_LOAD(x + j * DISTI_LANES);
+#define DISTI_MAC(i, j) a##i##j = DISTI_FMA(b, x##j, a##i##j);
+#define DISTI_SIDE(i, V) { const DISTI_VEC b = DISTI_SET1(w[i]); DISTI_X##V(DISTI_MAC, i) }
+#define DISTI_APART(i, V) { const DISTI_VEC b = DISTI_SET1(w[k##i]); DISTI_X##V(DISTI_MAC, i) }
+#define DISTI_STEP(R, V, FACTORS) { DISTI_X##V(DISTI_INPUT, 0) DISTI_Y##R(FACTORS, V) }
+
+/* Prefetches reach beyond the end of an array, where a pointer may not go. */
+#define DISTI_AHEAD(p, floats) DISTI_PREFETCH((const char *)((uintptr_t)(p) + sizeof(float) * (size_t)(floats)))
+#define DISTI_VECTORS(floats) (((floats) + DISTI_LANES - 1) / DISTI_LANES)
+
+#define DISTI_BITS1(i, j) bits |= (uint64_t)DISTI_POSITIVE(a##i##j) << (j * DISTI_LANES);
+#define DISTI_STORE_RELU1(i, j) DISTI_STORE(y + i * DISTI_BLOCK + j * DISTI_LANES, DISTI_RELU(a##i##j));
+#define DISTI_STORE_SUM1(i, j) DISTI_STORE(y + i * DISTI_BLOCK + j * DISTI_LANES, DISTI_ADD(a##i##j, DISTI_SET1(0.0f)));
+#define DISTI_STORE_SUM(i, V) DISTI_X##V(DISTI_STORE_SUM1, i)
+#define DISTI_STORE_RELU(i, V)                                                                                         \
+    {                                                                                                                  \
+        uint64_t bits = 0;                                                                                             \
+        DISTI_X##V(DISTI_BITS1, i)                                                                                     \
+        DISTI_X##V(DISTI_STORE_RELU1, i)                                                                               \
+        mask[i] |= (bits << c) & columns;                                                                              \
+    }
+
+/* Takes inputs from..to-1 of the list or of all; between two passes over DISTI_DEPTH rows the sums wait in y. Weights are
+   fetched ahead: the next ones, which are the next panel's at its end, or where passes cut the panels, the next panel's
+   own. */
+#define DISTI_GEMM_TILE(name, R, V)                                                                                    \
+    DISTI_NOINLINE DISTI_FUNCTION void disti_gemm_##name(const disti_gemm *g, int o, int c, int from, int to,          \
+                                                          size_t ahead)                                                \
+    {                                                                                                                  \
+        const float *panel = g->weights + (size_t)(o / 8) * (size_t)g->rows * 8 + o % 8;                               \
+        const float *input = g->x + c;                                                                                 \
+        const float *bias = g->bias + o;                                                                               \
+        float *y = g->y + (size_t)o * DISTI_BLOCK + c;                                                                 \
+        DISTI_Y##R(DISTI_ZERO, V)                                                                                      \
+        if (from == 0) {                                                                                               \
+            DISTI_Y##R(DISTI_BIAS, V)                                                                                  \
+        } else {                                                                                                       \
+            DISTI_Y##R(DISTI_AGAIN, V)                                                                                 \
+        }                                                                                                              \
+        if (g->alive) {                                                                                                \
+            for (const int *alive = g->alive + from, *end = g->alive + to; alive < end; alive++) {                     \
+                const float *w = panel + (size_t)(unsigned)*alive * 8;                                                 \
+                const float *x = input + (size_t)(unsigned)*alive * DISTI_BLOCK;                                       \
+                DISTI_AHEAD(w, ahead);                                                                                 \
+                DISTI_STEP(R, V, DISTI_SIDE)                                                                           \
+            }                                                                                                          \
+        } else {                                                                                                       \
+            const float *w = panel + (size_t)from * 8, *x = input + (size_t)from * DISTI_BLOCK;                        \
+            for (const float *end = panel + (size_t)to * 8; w < end; w += 8, x += DISTI_BLOCK) {                       \
+                DISTI_AHEAD(w, ahead);                                                                                 \
+                DISTI_STEP(R, V, DISTI_SIDE)                                                                           \
+            }                                                                                                          \
+        }                                                                                                              \
+        if (g->mask && to == (g->alive ? g->alive_count : g->rows)) {                                                  \
+            const uint64_t columns = ((uint64_t)1 << g->columns) - 1;                                                  \
+            uint64_t *mask = g->mask + o;                                                                              \
+            DISTI_Y##R(DISTI_STORE_RELU, V)                                                                            \
+        } else {                                                                                                       \
+            DISTI_Y##R(DISTI_STORE_SUM, V)                                                                             \
+        }                                                                                                              \
+    }
+
+/* k: the rows of this tile; from `count` on they repeat the last one and are not stored. */
+#define DISTI_OFFSET(i, V) const size_t k##i = (size_t)(unsigned)k[i] * 8;
+#define DISTI_RETURN1(i, j) a##i##j = DISTI_LOAD(d_x + k##i * (DISTI_BLOCK / 8) + j * DISTI_LANES);
+#define DISTI_RETURN(i, V) DISTI_X##V(DISTI_RETURN1, i)
+#define DISTI_STORE_KEEP1(i, j)                                                                                        \
+    DISTI_STORE(d_x + k##i * (DISTI_BLOCK / 8) + j * DISTI_LANES, DISTI_KEEP(a##i##j, bits >> (j * DISTI_LANES)));
+#define DISTI_STORE_KEEP(i, V)                                                                                         \
+    if (i < count) {                                                                                                   \
+        const uint64_t bits = g->mask ? g->mask[k[i]] >> c : ~(uint64_t)0;                                             \
+        DISTI_X##V(DISTI_STORE_KEEP1, i)                                                                               \
+    }
+
+#define DISTI_BACK_TILE(name, R, V)                                                                                    \
+    DISTI_NOINLINE DISTI_FUNCTION void disti_back_##name(const disti_gemm_back *g, const int *k, int count, int c,     \
+                                                          int from, int to)                                            \
+    {                                                                                                                  \
+        const float *weights = g->weights, *d_y = g->d_y + c;                                                          \
+        const size_t panel = (size_t)g->rows * 8;                                                                      \
+        const float *next = weights + (size_t)(unsigned)k[R - 1] * 8 + 8;                                              \
+        float *d_x = g->d_x + c;                                                                                       \
+        DISTI_Y##R(DISTI_OFFSET, V)                                                                                    \
+        DISTI_Y##R(DISTI_ZERO, V)                                                                                      \
+        if (from > 0) {                                                                                                \
+            DISTI_Y##R(DISTI_RETURN, V)                                                                                \
+        }                                                                                                              \
+        if (g->alive_out) {                                                                                            \
+            for (const int *alive = g->alive_out + from, *end = g->alive_out + to; alive < end; alive++) {             \
+                const size_t o = (size_t)(unsigned)*alive;                                                             \
+                const float *w = weights + (o >> 3) * panel + (o & 7);                                                 \
+                const float *x = d_y + o * DISTI_BLOCK;                                                                \
+                DISTI_AHEAD(next, (o >> 3) * panel + (o & 7) * 8);                                                     \
+                DISTI_STEP(R, V, DISTI_APART)                                                                          \
+            }                                                                                                          \
+        } else {                                                                                                       \
+            for (size_t o = (size_t)(unsigned)from, end = (size_t)(unsigned)to; o < end; o++) {                        \
+                const float *w = weights + (o >> 3) * panel + (o & 7);                                                 \
+                const float *x = d_y + o * DISTI_BLOCK;                                                                \
+                DISTI_AHEAD(next, (o >> 3) * panel + (o & 7) * 8);                                                     \
+                DISTI_STEP(R, V, DISTI_APART)                                                                          \
+            }                                                                                                          \
+        }                                                                                                              \
+        DISTI_Y##R(DISTI_STORE_KEEP, V)                                                                                \
+    }
+
+/* Only the last vector of a row can be a part of one. */
+#define DISTI_OUTPUT(i, V) const size_t k##i = (size_t)(unsigned)DISTI_MIN(i, count - 1) * DISTI_BLOCK;
+#define DISTI_ACCUMULATE1(i, j)                                                                                        \
+    if ((j + 1) * DISTI_LANES <= floats) {                                                                             \
+        DISTI_STORE(d_w + j * DISTI_LANES, DISTI_ADD(DISTI_LOAD(d_w + j * DISTI_LANES), a##i##j));                     \
+    } else {                                                                                                           \
+        DISTI_STORE(part, a##i##j);                                                                                    \
+        for (int n = 0; n < floats - j * DISTI_LANES; n++) d_w[j * DISTI_LANES + n] += part[n];                        \
+    }
+#define DISTI_ACCUMULATE(i, V)                                                                                         \
+    if (i < count) {                                                                                                   \
+        float *d_w = d_weights + (size_t)i * g->stride;                                                                \
+        DISTI_X##V(DISTI_ACCUMULATE1, i)                                                                               \
+    }
+
+#define DISTI_FETCH1(i, j) DISTI_AHEAD(d_weights, (size_t)i * g->stride + j * DISTI_LANES);
+#define DISTI_FETCH(i, V) DISTI_X##V(DISTI_FETCH1, i) DISTI_FETCH1(i, V)
+#define DISTI_WEIGHTS_TILE(name, R, V)                                                                                 \
+    DISTI_NOINLINE DISTI_FUNCTION void disti_weights_##name(const disti_gemm_weights *g, int o, int k, const float *x, \
+                                                             size_t x_stride)                                          \
+    {                                                                                                                  \
+        const int count = g->out - o, floats = g->rows - k;                                                            \
+        const float *w = g->d_y + (size_t)o * DISTI_BLOCK, *end = w + g->columns;                                      \
+        float *d_weights = g->d_weights + (size_t)o * g->stride + k;                                                   \
+        float part[DISTI_LANES];                                                                                       \
+        DISTI_Y##R(DISTI_FETCH, V)                                                                                     \
+        DISTI_Y##R(DISTI_OUTPUT, V)                                                                                    \
+        DISTI_Y##R(DISTI_ZERO, V)                                                                                      \
+        for (; w < end; w++, x += x_stride) DISTI_STEP(R, V, DISTI_APART)                                              \
+        DISTI_Y##R(DISTI_ACCUMULATE, V)                                                                                \
+    }
+
+#define DISTI_OUTER1(i, j)                                                                                             \
+    DISTI_STORE(to + j * DISTI_LANES, DISTI_KEEP(DISTI_FMA(b, x##j, zero), bits >> (j * DISTI_LANES)));
+#define DISTI_LAST_LAYER(isa)                                                                                          \
+    DISTI_FUNCTION void disti_dot_##isa(                                                                               \
+        const float *w, float bias_value, const float *matrix, const int *alive, int alive_count, int rows,            \
+        int columns, float *out)                                                                                       \
+    {                                                                                                                  \
+        const float *bias = &bias_value;                                                                               \
+        const int count = alive ? alive_count : rows;                                                                  \
+        for (int c = 0; c < columns; c += 3 * DISTI_LANES) {                                                           \
+            float *y = out + c;                                                                                        \
+            DISTI_ZERO(0, 3)                                                                                           \
+            DISTI_BIAS(0, 3)                                                                                           \
+            for (int n = 0; n < count; n++) {                                                                          \
+                const size_t k0 = (size_t)(unsigned)(alive ? alive[n] : n);                                            \
+                const float *x = matrix + k0 * DISTI_BLOCK + c;                                                        \
+                DISTI_STEP(1, 3, DISTI_APART)                                                                          \
+            }                                                                                                          \
+            DISTI_STORE_SUM(0, 3)                                                                                      \
+        }                                                                                                              \
+    }                                                                                                                  \
+    DISTI_FUNCTION void disti_outer_##isa(                                                                             \
+        const float *w, const float *s, const int *alive, int alive_count, int rows, int columns,                      \
+        const uint64_t *mask, float *y)                                                                                \
+    {                                                                                                                  \
+        const DISTI_VEC zero = DISTI_SET1(0.0f);                                                                       \
+        const int count = alive ? alive_count : rows;                                                                  \
+        for (int c = 0; c < columns; c += 3 * DISTI_LANES) {                                                           \
+            const float *x = s + c;                                                                                    \
+            DISTI_X3(DISTI_INPUT, 0)                                                                                   \
+            for (int n = 0; n < count; n++) {                                                                          \
+                const size_t k = (size_t)(unsigned)(alive ? alive[n] : n);                                             \
+                const uint64_t bits = mask ? mask[k] >> c : ~(uint64_t)0;                                              \
+                const DISTI_VEC b = DISTI_SET1(w[k]);                                                                  \
+                float *to = y + k * DISTI_BLOCK + c;                                                                   \
+                DISTI_X3(DISTI_OUTER1, 0)                                                                              \
+            }                                                                                                          \
+        }                                                                                                              \
+    }
+
+/* One pass over eight rows by R, with the tile that is V vectors wide. */
+#define DISTI_EIGHT(R, left, call)                                                                                     \
+    for (int i = 0; i < 8 && i < (left); i += R) call;
+#define DISTI_DRIVERS(isa, RW, VW, RM, VM, RN)                                                                         \
+    DISTI_FUNCTION void disti_gemm_##isa(const disti_gemm *g)                                                          \
+    {                                                                                                                  \
+        const int count = g->alive ? g->alive_count : g->rows;                                                         \
+        const size_t ahead = count > DISTI_DEPTH ? (size_t)g->rows * 8 : 256;                                          \
+        for (int o = 0; g->mask && o < (g->out + 7) / 8 * 8; o++) g->mask[o] = 0;                                      \
+        int to = 0;                                                                                                    \
+        do {                                                                                                           \
+            const int from = to;                                                                                       \
+            to = DISTI_MIN(from + DISTI_DEPTH, count);                                                                 \
+            for (int o = 0; o < g->out; o += 8) {                                                                      \
+                for (int c = 0; c < g->columns; c += VW * DISTI_LANES) {                                               \
+                    const int vectors = DISTI_VECTORS(g->columns - c);                                                 \
+                    if (vectors >= VW)                                                                                 \
+                        DISTI_EIGHT(RW, 8, disti_gemm_wide_##isa(g, o + i, c, from, to, ahead))                        \
+                    else if (vectors >= VM)                                                                            \
+                        DISTI_EIGHT(RM, 8, disti_gemm_middle_##isa(g, o + i, c, from, to, ahead))                      \
+                    else                                                                                               \
+                        DISTI_EIGHT(RN, 8, disti_gemm_narrow_##isa(g, o + i, c, from, to, ahead))                      \
+                }                                                                                                      \
+            }                                                                                                          \
+        } while (to < count);                                                                                          \
+    }                                                                                                                  \
+    DISTI_FUNCTION void disti_gemm_back_##isa(const disti_gemm_back *g)                                                \
+    {                                                                                                                  \
+        const int rows = g->alive_rows ? g->alive_rows_count : g->rows;                                                \
+        const int count = g->alive_out ? g->alive_out_count : g->out;                                                  \
+        int to = 0;                                                                                                    \
+        do {                                                                                                           \
+            const int from = to;                                                                                       \
+            to = DISTI_MIN(from + DISTI_DEPTH, count);                                                                 \
+            for (int n = 0; n < rows; n += 8) {                                                                        \
+                const int left = rows - n;                                                                             \
+                int k[8];                                                                                              \
+                for (int i = 0; i < 8; i++) {                                                                          \
+                    const int row = DISTI_MIN(n + i, rows - 1);                                                        \
+                    k[i] = g->alive_rows ? g->alive_rows[row] : row;                                                   \
+                }                                                                                                      \
+                for (int c = 0; c < g->columns; c += VW * DISTI_LANES) {                                               \
+                    const int vectors = DISTI_VECTORS(g->columns - c);                                                 \
+                    if (vectors >= VW)                                                                                 \
+                        DISTI_EIGHT(RW, left, disti_back_wide_##isa(g, k + i, left - i, c, from, to))                  \
+                    else if (vectors >= VM)                                                                            \
+                        DISTI_EIGHT(RM, left, disti_back_middle_##isa(g, k + i, left - i, c, from, to))                \
+                    else                                                                                               \
+                        DISTI_EIGHT(RN, left, disti_back_narrow_##isa(g, k + i, left - i, c, from, to))                \
+                }                                                                                                      \
+            }                                                                                                          \
+        } while (to < count);                                                                                          \
+    }                                                                                                                  \
+    DISTI_FUNCTION void disti_gemm_weights_##isa(const disti_gemm_weights *g)                                          \
+    {                                                                                                                  \
+        float packed[DISTI_BLOCK * VW * DISTI_LANES];                                                                  \
+        for (int k = 0; k < g->rows; k += VW * DISTI_LANES) {                                                          \
+            const int vectors = DISTI_MIN(DISTI_VECTORS(g->rows - k), VW);                                             \
+            const float *x = g->xt + k;                                                                                \
+            size_t x_stride = g->xt_stride;                                                                            \
+            if (x_stride > 128) {                                                                                      \
+                const size_t bytes = (size_t)(vectors * DISTI_LANES) * sizeof(float);                                  \
+                x_stride = VW * DISTI_LANES;                                                                           \
+                for (size_t c = 0; c < (size_t)(unsigned)g->columns; c++)                                              \
+                    memcpy(packed + c * x_stride, x + c * g->xt_stride, bytes);                                        \
+                x = packed;                                                                                            \
+            }                                                                                                          \
+            for (int o = 0; o < g->out; o += 8) {                                                                      \
+                const int left = g->out - o;                                                                           \
+                if (vectors >= VW)                                                                                     \
+                    DISTI_EIGHT(RW, left, disti_weights_wide_##isa(g, o + i, k, x, x_stride))                          \
+                else if (vectors >= VM)                                                                                \
+                    DISTI_EIGHT(RM, left, disti_weights_middle_##isa(g, o + i, k, x, x_stride))                        \
+                else                                                                                                   \
+                    DISTI_EIGHT(RN, left, disti_weights_narrow_##isa(g, o + i, k, x, x_stride))                        \
+            }                                                                                                          \
+        }                                                                                                              \
+    }
+
+#define DISTI_KERNELS(isa, RW, VW, RM, VM, RN)                                                                         \
+    DISTI_GEMM_TILE(wide_##isa, RW, VW)                                                                                \
+    DISTI_GEMM_TILE(middle_##isa, RM, VM)                                                                              \
+    DISTI_GEMM_TILE(narrow_##isa, RN, 1)                                                                               \
+    DISTI_BACK_TILE(wide_##isa, RW, VW)                                                                                \
+    DISTI_BACK_TILE(middle_##isa, RM, VM)                                                                              \
+    DISTI_BACK_TILE(narrow_##isa, RN, 1)                                                                               \
+    DISTI_WEIGHTS_TILE(wide_##isa, RW, VW)                                                                             \
+    DISTI_WEIGHTS_TILE(middle_##isa, RM, VM)                                                                           \
+    DISTI_WEIGHTS_TILE(narrow_##isa, RN, 1)                                                                            \
+    DISTI_LAST_LAYER(isa)                                                                                              \
+    DISTI_DRIVERS(isa, RW, VW, RM, VM, RN)
+
+#ifdef DISTI_X86
+#define DISTI_PREFETCH(p) _mm_prefetch(p, _MM_HINT_T0)
+
+#define DISTI_FUNCTION DISTI_TARGET("sse2") DISTI_KERNEL static
+#define DISTI_VEC __m128
+#define DISTI_LANES 4
+#define DISTI_SET1(s) _mm_set1_ps(s)
+#define DISTI_LOAD(p) _mm_loadu_ps(p)
+#define DISTI_STORE(p, v) _mm_storeu_ps(p, v)
+#define DISTI_ADD(a, b) _mm_add_ps(a, b)
+#define DISTI_FMA(a, b, c) _mm_add_ps(_mm_mul_ps(a, b), c)
+#define DISTI_RELU(v) _mm_max_ps(v, _mm_setzero_ps())
+#define DISTI_POSITIVE(v) (unsigned)_mm_movemask_ps(_mm_cmpgt_ps(v, _mm_setzero_ps()))
+#define DISTI_KEEP(v, bits) disti_keep_sse2(v, (int)((bits) & 0xf))
+DISTI_FUNCTION __m128 disti_keep_sse2(__m128 v, int bits)
+{
+    const __m128i lane = _mm_setr_epi32(1, 2, 4, 8);
+    return _mm_and_ps(v, _mm_castsi128_ps(_mm_cmpeq_epi32(_mm_and_si128(_mm_set1_epi32(bits), lane), lane)));
+}
+#define DISTI_DEPTH 112
+DISTI_KERNELS(sse2, 4, 2, 4, 2, 8)
+#undef DISTI_FUNCTION
+#undef DISTI_VEC
+#undef DISTI_LANES
+#undef DISTI_DEPTH
+#undef DISTI_SET1
+#undef DISTI_LOAD
+#undef DISTI_STORE
+#undef DISTI_ADD
+#undef DISTI_FMA
+#undef DISTI_RELU
+#undef DISTI_POSITIVE
+#undef DISTI_KEEP
+
+#define DISTI_FUNCTION DISTI_TARGET("avx2,fma") DISTI_KERNEL static
+#define DISTI_VEC __m256
+#define DISTI_LANES 8
+#define DISTI_SET1(s) _mm256_set1_ps(s)
+#define DISTI_LOAD(p) _mm256_loadu_ps(p)
+#define DISTI_STORE(p, v) _mm256_storeu_ps(p, v)
+#define DISTI_ADD(a, b) _mm256_add_ps(a, b)
+#define DISTI_FMA(a, b, c) _mm256_fmadd_ps(a, b, c)
+#define DISTI_RELU(v) _mm256_max_ps(v, _mm256_setzero_ps())
+#define DISTI_POSITIVE(v) (unsigned)_mm256_movemask_ps(_mm256_cmp_ps(v, _mm256_setzero_ps(), _CMP_GT_OQ))
+#define DISTI_KEEP(v, bits) disti_keep_avx2(v, (int)((bits) & 0xff))
+DISTI_FUNCTION __m256 disti_keep_avx2(__m256 v, int bits)
+{
+    const __m256i lane = _mm256_setr_epi32(1, 2, 4, 8, 16, 32, 64, 128);
+    const __m256i both = _mm256_and_si256(_mm256_set1_epi32(bits), lane);
+    return _mm256_and_ps(v, _mm256_castsi256_ps(_mm256_cmpeq_epi32(both, lane)));
+}
+#define DISTI_DEPTH 112
+DISTI_KERNELS(avx2, 4, 3, 4, 2, 8)
+#undef DISTI_FUNCTION
+#undef DISTI_VEC
+#undef DISTI_LANES
+#undef DISTI_DEPTH
+#undef DISTI_SET1
+#undef DISTI_LOAD
+#undef DISTI_STORE
+#undef DISTI_ADD
+#undef DISTI_FMA
+#undef DISTI_RELU
+#undef DISTI_POSITIVE
+#undef DISTI_KEEP
+
+#define DISTI_FUNCTION DISTI_TARGET("avx512f,avx512bw,avx512dq,avx512vl,fma") DISTI_KERNEL static
+#define DISTI_VEC __m512
+#define DISTI_LANES 16
+#define DISTI_SET1(s) _mm512_set1_ps(s)
+#define DISTI_LOAD(p) _mm512_loadu_ps(p)
+#define DISTI_STORE(p, v) _mm512_storeu_ps(p, v)
+#define DISTI_ADD(a, b) _mm512_add_ps(a, b)
+#define DISTI_FMA(a, b, c) _mm512_fmadd_ps(a, b, c)
+/* Unmasked, gcc 12 warns in C++ that its own header uses an uninitialized variable. */
+#define DISTI_RELU(v) _mm512_maskz_max_ps((__mmask16)0xffff, v, _mm512_setzero_ps())
+#define DISTI_POSITIVE(v) _mm512_cmp_ps_mask(v, _mm512_setzero_ps(), _CMP_GT_OQ)
+#define DISTI_KEEP(v, bits) _mm512_maskz_mov_ps((__mmask16)((bits) & 0xffff), v)
+#define DISTI_DEPTH 512
+DISTI_KERNELS(avx512, 8, 3, 8, 2, 8)
+#endif
+
+#ifdef DISTI_NEON
+#if defined(__GNUC__) || defined(__clang__)
+#define DISTI_PREFETCH(p) __builtin_prefetch(p)
+#else
+#define DISTI_PREFETCH(p) __prefetch(p)
+#endif
+
+/* The factors of a tile come as lanes of two vectors instead of eight broadcasts. */
+#undef DISTI_SIDE
+#define DISTI_MAC_LANE(i, j) a##i##j = vfmaq_laneq_f32(a##i##j, x##j, b, (i) & 3);
+#define DISTI_SIDE(i, V) { const float32x4_t b = vld1q_f32(w + ((i) & 4)); DISTI_X##V(DISTI_MAC_LANE, i) }
+
+#define DISTI_FUNCTION DISTI_KERNEL static
+#define DISTI_VEC float32x4_t
+#define DISTI_LANES 4
+#define DISTI_SET1(s) vdupq_n_f32(s)
+#define DISTI_LOAD(p) vld1q_f32(p)
+#define DISTI_STORE(p, v) vst1q_f32(p, v)
+#define DISTI_ADD(a, b) vaddq_f32(a, b)
+#define DISTI_FMA(a, b, c) vfmaq_f32(c, a, b)
+#define DISTI_RELU(v) disti_relu_neon(v)
+#define DISTI_POSITIVE(v) disti_positive_neon(v)
+#define DISTI_KEEP(v, bits) disti_keep_neon(v, (uint32_t)((bits) & 0xf))
+static float32x4_t disti_relu_neon(float32x4_t v)
+{
+    const uint32x4_t positive = vcgtq_f32(v, vdupq_n_f32(0.0f));
+    return vreinterpretq_f32_u32(vandq_u32(vreinterpretq_u32_f32(v), positive));
+}
+static unsigned disti_positive_neon(float32x4_t v)
+{
+    static const uint32_t lane[4] = {1, 2, 4, 8};
+    return vaddvq_u32(vandq_u32(vcgtq_f32(v, vdupq_n_f32(0.0f)), vld1q_u32(lane)));
+}
+static float32x4_t disti_keep_neon(float32x4_t v, uint32_t bits)
+{
+    static const uint32_t lane[4] = {1, 2, 4, 8};
+    return vreinterpretq_f32_u32(vandq_u32(vreinterpretq_u32_f32(v), vtstq_u32(vdupq_n_u32(bits), vld1q_u32(lane))));
+}
+#define DISTI_DEPTH 112
+DISTI_KERNELS(neon, 8, 3, 8, 2, 8)
+#endif
+#endif
+
+#define DISTI_TABLE(isa) \
+    kernels.gemm = disti_gemm_##isa; \
+    kernels.gemm_back = disti_gemm_back_##isa; \
+    kernels.gemm_weights = disti_gemm_weights_##isa; \
+    kernels.dot = disti_dot_##isa; \
+    kernels.outer = disti_outer_##isa;
+
+/* isa: one that disti_cpu_has */
+static disti_kernels disti_kernels_for(int isa)
+{
+    disti_kernels kernels;
+    DISTI_TABLE(scalar)
+#ifdef DISTI_X86
+    if (isa == DIST_ISA_SSE2) { DISTI_TABLE(sse2) }
+    if (isa == DIST_ISA_AVX2) { DISTI_TABLE(avx2) }
+    if (isa == DIST_ISA_AVX512) { DISTI_TABLE(avx512) }
+#endif
+#ifdef DISTI_NEON
+    if (isa == DIST_ISA_NEON) { DISTI_TABLE(neon) }
+#endif
+    (void)isa;
+    return kernels;
+}
+
+#undef DISTI_NOINLINE
+#undef DISTI_X1
+#undef DISTI_X2
+#undef DISTI_X3
+#undef DISTI_Y1
+#undef DISTI_Y4
+#undef DISTI_Y8
+#undef DISTI_ZERO1
+#undef DISTI_BIAS1
+#undef DISTI_AGAIN1
+#undef DISTI_ZERO
+#undef DISTI_BIAS
+#undef DISTI_AGAIN
+#undef DISTI_INPUT
+#undef DISTI_MAC
+#undef DISTI_SIDE
+#undef DISTI_APART
+#undef DISTI_STEP
+#undef DISTI_AHEAD
+#undef DISTI_VECTORS
+#undef DISTI_BITS1
+#undef DISTI_STORE_RELU1
+#undef DISTI_STORE_SUM1
+#undef DISTI_STORE_SUM
+#undef DISTI_STORE_RELU
+#undef DISTI_GEMM_TILE
+#undef DISTI_OFFSET
+#undef DISTI_RETURN1
+#undef DISTI_RETURN
+#undef DISTI_STORE_KEEP1
+#undef DISTI_STORE_KEEP
+#undef DISTI_BACK_TILE
+#undef DISTI_OUTPUT
+#undef DISTI_ACCUMULATE1
+#undef DISTI_ACCUMULATE
+#undef DISTI_FETCH1
+#undef DISTI_FETCH
+#undef DISTI_WEIGHTS_TILE
+#undef DISTI_OUTER1
+#undef DISTI_LAST_LAYER
+#undef DISTI_EIGHT
+#undef DISTI_DRIVERS
+#undef DISTI_KERNELS
+#undef DISTI_PREFETCH
+#undef DISTI_FUNCTION
+#undef DISTI_VEC
+#undef DISTI_LANES
+#undef DISTI_SET1
+#undef DISTI_LOAD
+#undef DISTI_STORE
+#undef DISTI_ADD
+#undef DISTI_FMA
+#undef DISTI_RELU
+#undef DISTI_POSITIVE
+#undef DISTI_KEEP
+#undef DISTI_DEPTH
+#undef DISTI_MAC_LANE
+#undef DISTI_TABLE
+
+/* exp to 2 ulp; below -87 it is 0, above 88 the largest float. */
+static float disti_exp(float x)
+{
+    x = x > 88.0f ? 88.0f : x;
+    x = x < -87.0f ? -87.0f : x;
+    float n = x * 1.44269504f;
+    int32_t k = (int32_t)(n < 0.0f ? n - 0.5f : n + 0.5f);
+    n = (float)k;
+    float r = x - n * 0.693359375f;
+    r += n * 2.12194440e-4f;
+    float p = 1.9875691500e-4f;
+    p = p * r + 1.3981999507e-3f;
+    p = p * r + 8.3334519073e-3f;
+    p = p * r + 4.1665795894e-2f;
+    p = p * r + 1.6666665459e-1f;
+    p = p * r + 5.0000001201e-1f;
+    p = p * r * r + r + 1.0f;
+    uint32_t bits = (uint32_t)(k + 127) << 23;
+    float scale;
+    memcpy(&scale, &bits, sizeof scale);
+    return p * scale;
+}
+
+static float disti_tanh(float x)
+{
+    float a = x < 0.0f ? -x : x;
+    float s = x * x;
+    float small = x + x * s * ((((-5.70498872745e-3f * s + 2.06390887954e-2f) * s - 5.37397155531e-2f) * s +
+                                1.33314422036e-1f) * s - 3.33332819422e-1f);
+    float large = 1.0f - 2.0f / (disti_exp(2.0f * (a > 20.0f ? 20.0f : a)) + 1.0f);
+    return a < 0.625f ? small : (x < 0.0f ? -large : large);
+}
+
+static float disti_sigmoid(float x)
+{
+    float e = disti_exp(x < 0.0f ? x : -x);
+    return x < 0.0f ? e / (1.0f + e) : 1.0f / (1.0f + e);
+}
+
+/* Their derivatives, by e = exp(-2 |x|) and exp(-|x|): relatively exact where 1 - tanh^2 would have cancelled to nothing. */
+static float disti_tanh_slope(float x)
+{
+    float e = disti_exp(x < 0.0f ? 2.0f * x : -2.0f * x);
+    return 4.0f * e / ((1.0f + e) * (1.0f + e));
+}
+
+static float disti_sigmoid_slope(float x)
+{
+    float e = disti_exp(x < 0.0f ? x : -x);
+    return e / ((1.0f + e) * (1.0f + e));
+}
+
+/* log(1 + exp(-a)), a >= 0: the smooth part of softplus, by 2 atanh(u / (2 + u)). */
+static float disti_log1p_exp(float a)
+{
+    float u = disti_exp(-a);
+    float s = u / (2.0f + u);
+    float q = s * s;
+    return 2.0f * s * (1.0f + q * (1.0f / 3 + q * (1.0f / 5 + q * (1.0f / 7 + q * (1.0f / 9 + q * (1.0f / 11 + q * (1.0f / 13)))))));
+}
+
+/* Sine and cosine of a double, range-reduced by multiples of pi / 2 in two parts: full float accuracy up to 1e9, and
+   values in [-1, 1] for anything finite. */
+static void disti_sincos(double x, double *sine, double *cosine)
+{
+    if (!(x > -1e15 && x < 1e15)) x = 0.0;
+    double q = x * 0.63661977236758134308;
+    int64_t k = (int64_t)(q < 0 ? q - 0.5 : q + 0.5);
+    double r = (x - (double)k * 1.57079632673412561417) - (double)k * 6.07710050650619224932e-11;
+    double s = r * r;
+    double sn = r + r * s * (-1.66666666666666324348e-1 + s * (8.33333333332248946124e-3 + s * (-1.98412698298579493134e-4 +
+                s * (2.75573137070700676789e-6 + s * -2.50507602534068634195e-8))));
+    double cs = 1.0 - s * (0.5 - s * (4.16666666666666019037e-2 - s * (1.38888888888741095749e-3 -
+                s * (2.48015872894767294178e-5 - s * 2.75573143513906633035e-7))));
+    int odd = (int)(k & 1);
+    double a = odd ? cs : sn, b = odd ? sn : cs;
+    *sine = (k & 2) ? -a : a;
+    *cosine = ((k + 1) & 2) ? -b : b;
+}
+
+/* y <- activation(y), n values; slope (n) gets its derivative unless NULL. scale: softplus's beta, sine's omega. */
+static void disti_activate(int activation, float scale, size_t n, float *y, float *slope)
+{
+    for (size_t i = 0; i < n; i++) {
+        float x = y[i], v = x, d = 1.0f;
+        switch (activation) {
+        case DIST_ACTIVATION_RELU:
+            d = x > 0.0f ? 1.0f : 0.0f;
+            v = x > 0.0f ? x : 0.0f;
+            break;
+        case DIST_ACTIVATION_ELU: {
+            float near_zero = x * (1.0f + x * (0.5f + x * (1.0f / 6 + x * (1.0f / 24 + x * (1.0f / 120)))));
+            v = x > 0.0f ? x : (x > -0.1f ? near_zero : disti_exp(x) - 1.0f);
+            d = x > 0.0f ? 1.0f : v + 1.0f;
+            break;
+        }
+        case DIST_ACTIVATION_SOFTPLUS: {
+            float a = scale * x;
+            v = (x > 0.0f ? x : 0.0f) + disti_log1p_exp(a < 0.0f ? -a : a) / scale;
+            d = disti_sigmoid(a);
+            break;
+        }
+        case DIST_ACTIVATION_SINE: {
+            double s, c;
+            disti_sincos((double)scale * (double)x, &s, &c);
+            v = (float)s;
+            d = (float)((double)scale * c);
+            break;
+        }
+        case DIST_ACTIVATION_TANH:
+            v = disti_tanh(x);
+            d = disti_tanh_slope(x);
+            break;
+        case DIST_ACTIVATION_NONE: break;
+        }
+        y[i] = v;
+        if (slope) slope[i] = d;
+    }
+}
+
+/*@ 04 field --------------------------------------------------------------------------------------------------------------- */
+
+/* Analytic fields: f, grad f and the adjoint for the numbers they are made of, in one function each; q = p - center.
+   At the few points where |q| or the like is 0 the gradient is 0. */
+static float disti_length(float x, float y, float z)
+{
+    return sqrtf(x * x + y * y + z * z);
+}
+
+/* sphere    f = |q| - r          df/dp = q / |q|    df/dcenter = -df/dp    df/dr = -1 */
+static void disti_sphere_point(const float *c, const float *p, float *f, float *g, float *d_c)
+{
+    float q[3] = {p[0] - c[0], p[1] - c[1], p[2] - c[2]};
+    float length = disti_length(q[0], q[1], q[2]);
+    float inverse = length > 0.0f ? 1.0f / length : 0.0f;
+    *f = length - c[3];
+    for (int i = 0; i < 3; i++) {
+        g[i] = q[i] * inverse;
+        d_c[i] = -g[i];
+    }
+    d_c[3] = -1.0f;
+}
+
+/* torus     h = sqrt(qx^2 + qz^2) - R,  f = sqrt(h^2 + qy^2) - r
+   backward  df/dp = (h ex, qy, h ez) / sqrt(..)   df/dR = -h / sqrt(..)   df/dr = -1 */
+static void disti_torus_point(const float *c, const float *p, float *f, float *g, float *d_c)
+{
+    float q[3] = {p[0] - c[0], p[1] - c[1], p[2] - c[2]};
+    float ring = sqrtf(q[0] * q[0] + q[2] * q[2]);
+    float h = ring - c[3];
+    float length = sqrtf(h * h + q[1] * q[1]);
+    float inverse = length > 0.0f ? 1.0f / length : 0.0f;
+    float inverse_ring = ring > 0.0f ? 1.0f / ring : 0.0f;
+    *f = length - c[4];
+    g[0] = h * inverse * q[0] * inverse_ring;
+    g[1] = q[1] * inverse;
+    g[2] = h * inverse * q[2] * inverse_ring;
+    for (int i = 0; i < 3; i++) d_c[i] = -g[i];
+    d_c[3] = -h * inverse;
+    d_c[4] = -1.0f;
+}
+
+/* box       a = |q| - half,  f = |max(a, 0)| + min(max(a), 0)
+   backward  outside: df/da = max(a, 0) / |max(a, 0)|; inside: 1 for the largest a; df/dp = sign(q) df/da, df/dhalf = -df/da */
+static void disti_box_point(const float *c, const float *p, float *f, float *g, float *d_c)
+{
+    float a[3], d_a[3] = {0.0f, 0.0f, 0.0f};
+    int largest = 0;
+    for (int i = 0; i < 3; i++) {
+        float q = p[i] - c[i];
+        a[i] = (q < 0.0f ? -q : q) - c[3 + i];
+        if (a[i] > a[largest]) largest = i;
+    }
+    float x = DISTI_MAX(a[0], 0.0f), y = DISTI_MAX(a[1], 0.0f), z = DISTI_MAX(a[2], 0.0f);
+    float outside = disti_length(x, y, z);
+    *f = outside + DISTI_MIN(a[largest], 0.0f);
+    if (outside > 0.0f) {
+        d_a[0] = x / outside;
+        d_a[1] = y / outside;
+        d_a[2] = z / outside;
+    } else {
+        d_a[largest] = 1.0f;
+    }
+    for (int i = 0; i < 3; i++) {
+        g[i] = p[i] < c[i] ? -d_a[i] : d_a[i];
+        d_c[i] = -g[i];
+        d_c[3 + i] = -d_a[i];
+    }
+}
+
+typedef void (*disti_point_fn)(const float *c, const float *p, float *f, float *g, float *d_c);
+
+static void disti_analytic_eval(disti_point_fn point_fn, void *user, size_t n, const float *points, float *sdf, float *gradient)
+{
+    for (size_t i = 0; i < n; i++) {
+        float g[3], d_c[8];
+        point_fn((const float *)user, points + 3 * i, sdf + i, g, d_c);
+        if (gradient) memcpy(gradient + 3 * i, g, sizeof g);
+    }
+}
+
+static void disti_analytic_adjoint(disti_point_fn point_fn, int size, void *user, size_t n, const float *points,
+                                   const float *d_sdf, double *d_code)
+{
+    for (size_t i = 0; i < n; i++) {
+        float f, g[3], d_c[8];
+        point_fn((const float *)user, points + 3 * i, &f, g, d_c);
+        for (int j = 0; j < size; j++) d_code[j] += (double)d_sdf[i] * (double)d_c[j];
+    }
+}
+
+static dist_field disti_analytic(const float *numbers, int size, float radius)
+{
+    dist_field field;
+    union {
+        const float *in;
+        void *out; /* user is not const, the numbers are: they are never written */
+    } user;
+    memset(&field, 0, sizeof field);
+    user.in = numbers;
+    field.user = user.out;
+    memcpy(field.center, numbers, sizeof field.center);
+    field.radius = radius;
+    field.lipschitz = 1.0f;
+    field.code_size = size;
+    return field;
+}
+
+#define DISTI_ANALYTIC(name, size)                                                                                          \
+    static void disti_##name##_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)    \
+    {                                                                                                                      \
+        (void)worker;                                                                                                      \
+        disti_analytic_eval(disti_##name##_point, user, n, points, sdf, gradient);                                         \
+    }                                                                                                                      \
+    static void disti_##name##_adjoint(void *user, int worker, size_t n, const float *points, const float *d_sdf,          \
+                                       double *d_code)                                                                     \
+    {                                                                                                                      \
+        (void)worker;                                                                                                      \
+        disti_analytic_adjoint(disti_##name##_point, size, user, n, points, d_sdf, d_code);                                \
+    }
+
+DISTI_ANALYTIC(sphere, 4)
+DISTI_ANALYTIC(torus, 5)
+DISTI_ANALYTIC(box, 6)
+
+DIST_API dist_field dist_field_sphere(const float center_radius[4])
+{
+    dist_field field = disti_analytic(center_radius, 4, 1.1f * center_radius[3]);
+    field.eval_fn = disti_sphere_eval;
+    field.adjoint_fn = disti_sphere_adjoint;
+    return field;
+}
+
+DIST_API dist_field dist_field_torus(const float center_radii[5])
+{
+    dist_field field = disti_analytic(center_radii, 5, 1.1f * (center_radii[3] + center_radii[4]));
+    field.eval_fn = disti_torus_eval;
+    field.adjoint_fn = disti_torus_adjoint;
+    return field;
+}
+
+DIST_API dist_field dist_field_box(const float center_half[6])
+{
+    dist_field field = disti_analytic(center_half, 6, 1.1f * disti_length(center_half[3], center_half[4], center_half[5]));
+    field.eval_fn = disti_box_eval;
+    field.adjoint_fn = disti_box_adjoint;
+    return field;
+}
+
+/* What makes a field unusable, for every function that takes one. */
+static dist_status disti_field_check(dist_context *ctx, const dist_field *field, const char *function)
+{
+    if (!field) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field is NULL", function, 0, 0);
+    if (!field->eval_fn)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT,
+                          "%s: field.eval_fn is NULL (a failed create, or a net without a distance channel)", function, 0, 0);
+    if (!disti_finite_all(3, field->center) || !disti_finite(field->radius) || !(field->radius > 0.0f))
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.radius is %d, must be positive and the center finite", function,
+                          (double)field->radius, 0);
+    if (!disti_finite(field->lipschitz) || field->lipschitz < 0.0f)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.lipschitz is %d, must be 0 or positive", function,
+                          (double)field->lipschitz, 0);
+    if (!disti_finite(field->clamp) || field->clamp < 0.0f)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.clamp is %d, must be 0 or positive", function,
+                          (double)field->clamp, 0);
+    if (field->code_size < 0)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.code_size is %d, must not be negative", function,
+                          field->code_size, 0);
+    if (field->owner && field->owner != ctx)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field belongs to another context", function, 0, 0);
+    return DIST_OK;
+}
+
+/* Work is cut into pieces of whole kernel blocks, at most 2^30 of them: the count follows from n alone. */
+typedef struct disti_pieces {
+    size_t n, size;
+    int count;
+} disti_pieces;
+
+static disti_pieces disti_cut(size_t n, size_t size, size_t most)
+{
+    disti_pieces p;
+    p.n = n;
+    p.size = size;
+    while (n / p.size >= most) p.size *= 2;
+    p.count = (int)((n + p.size - 1) / p.size);
+    return p;
+}
+
+typedef struct disti_eval_job {
+    const dist_field *field;
+    disti_pieces pieces;
+    const float *points;
+    float *sdf, *gradient;
+} disti_eval_job;
+
+static void disti_eval_task(void *arg, int index, int worker)
+{
+    const disti_eval_job *job = (const disti_eval_job *)arg;
+    size_t first = (size_t)index * job->pieces.size;
+    size_t n = DISTI_MIN(job->pieces.size, job->pieces.n - first);
+    job->field->eval_fn(job->field->user, worker, n, job->points + 3 * first, job->sdf + first,
+                        job->gradient ? job->gradient + 3 * first : NULL);
+}
+
+/* dist_field_eval behind the door. */
+static void disti_field_eval_all(dist_context *ctx, const dist_field *field, size_t n, const float *points, float *sdf,
+                                 float *gradient)
+{
+    disti_eval_job job;
+    if (n == 0) return;
+    job.field = field;
+    job.pieces = disti_cut(n, 8 * DISTI_BLOCK, 1u << 20);
+    job.points = points;
+    job.sdf = sdf;
+    job.gradient = gradient;
+    disti_run(ctx, job.pieces.count, disti_eval_task, &job);
+}
+
+DIST_API dist_status dist_field_eval(dist_context *ctx, const dist_field *field, size_t n, const float *points, float *sdf,
+                                     float *gradient)
+{
+    dist_status status = disti_enter(ctx, "dist_field_eval");
+    if (status == DIST_OK) status = disti_field_check(ctx, field, "dist_field_eval");
+    if (status != DIST_OK || n == 0) return status;
+    if (!points || !sdf)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_field_eval: %s is NULL", points ? "sdf" : "points", 0, 0);
+    disti_field_eval_all(ctx, field, n, points, sdf, gradient);
+    return DIST_OK;
+}
+
+#ifndef DIST_NO_BACKWARD
+/* One slot's share of dist_field_backward; d_code holds the slot's own sums. */
+typedef struct disti_backward_job {
+    const dist_field *field;
+    disti_pieces pieces;
+    const float *points;
+    float *d_sdf;
+    dist_seed_fn seed_fn;
+    void *seed_user;
+    float *d_points;
+    double *d_code; /* (pieces.count, code_size) or NULL */
+} disti_backward_job;
+
+/* The part of a piece that a seed call is about. */
+typedef struct disti_backward_piece {
+    const disti_backward_job *job;
+    size_t first;
+} disti_backward_piece;
+
+static void disti_backward_seed(void *user, size_t first, size_t count, const float *sdf, const float *gradient, float *d_sdf)
+{
+    const disti_backward_piece *piece = (const disti_backward_piece *)user;
+    const disti_backward_job *job = piece->job;
+    size_t at = piece->first + first;
+    if (job->seed_fn) job->seed_fn(job->seed_user, at, count, sdf, gradient, d_sdf);
+    else memcpy(d_sdf, job->d_sdf + at, count * sizeof(float));
+    if (job->seed_fn && job->d_sdf) memcpy(job->d_sdf + at, d_sdf, count * sizeof(float));
+    if (!job->d_points || !gradient) return;
+    for (size_t i = 0; i < count; i++)
+        for (size_t j = 0; j < 3; j++) job->d_points[3 * (at + i) + j] += d_sdf[i] * gradient[3 * i + j];
+}
+
+static void disti_backward_task(void *arg, int index, int worker)
+{
+    const disti_backward_job *job = (const disti_backward_job *)arg;
+    const dist_field *field = job->field;
+    disti_backward_piece piece;
+    piece.job = job;
+    piece.first = (size_t)index * job->pieces.size;
+    size_t n = DISTI_MIN(job->pieces.size, job->pieces.n - piece.first);
+    double *d_code = job->d_code ? job->d_code + (size_t)index * (size_t)field->code_size : NULL;
+    const float *points = job->points + 3 * piece.first;
+    if (field->fused_fn) {
+        field->fused_fn(field->user, worker, n, points, NULL, NULL, disti_backward_seed, &piece, d_code);
+        return;
+    }
+    for (size_t at = 0; at < n; at += DISTI_BLOCK) {
+        float sdf[DISTI_BLOCK], gradient[3 * DISTI_BLOCK], d_sdf[DISTI_BLOCK];
+        size_t count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK);
+        field->eval_fn(field->user, worker, count, points + 3 * at, sdf, gradient);
+        disti_backward_seed(&piece, at, count, sdf, gradient, d_sdf);
+        if (d_code) field->adjoint_fn(field->user, worker, count, points + 3 * at, d_sdf, d_code);
+    }
+}
+
+/* dist_field_backward behind the door: d_code in double, partial sums in slot order. ctx->partial is large enough. */
+static void disti_field_backward_all(dist_context *ctx, const dist_field *field, size_t n, const float *points, float *d_sdf,
+                                     dist_seed_fn seed_fn, void *seed_user, float *d_points, double *d_code)
+{
+    disti_backward_job job;
+    size_t size = (size_t)field->code_size;
+    if (n == 0) return;
+    job.field = field;
+    job.pieces = disti_cut(n, 4 * DISTI_BLOCK, DISTI_SLOTS);
+    job.points = points;
+    job.d_sdf = d_sdf;
+    job.seed_fn = seed_fn;
+    job.seed_user = seed_user;
+    job.d_points = d_points;
+    job.d_code = d_code ? ctx->partial : NULL;
+    if (d_code) memset(ctx->partial, 0, (size_t)job.pieces.count * size * sizeof(double));
+    disti_run(ctx, job.pieces.count, disti_backward_task, &job);
+    if (!d_code) return;
+    for (size_t slot = 0; slot < (size_t)job.pieces.count; slot++)
+        for (size_t j = 0; j < size; j++) d_code[j] += ctx->partial[slot * size + j];
+}
+
+static dist_status disti_gradients_check(dist_context *ctx, const dist_field *field, const dist_gradients *grads,
+                                         const char *function)
+{
+    if (!grads) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: grads is NULL", function, 0, 0);
+    if (grads->code && (field->code_size == 0 || (!field->adjoint_fn && !field->fused_fn)))
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: grads.code is given, but the field has no code or no adjoint_fn",
+                          function, 0, 0);
+    if (grads->weights && !field->weights_fn)
+        return disti_fail(ctx, DIST_UNSUPPORTED, "%s: grads.weights is given, but the field has no weights_fn", function, 0, 0);
+    return DIST_OK;
+}
+
+DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *field, size_t n, const float *points,
+                                         float *d_sdf, dist_seed_fn seed_fn, void *seed_user, float *d_points,
+                                         const dist_gradients *grads)
+{
+    const char *name = "dist_field_backward";
+    dist_status status = disti_enter(ctx, name);
+    if (status == DIST_OK) status = disti_field_check(ctx, field, name);
+    if (status == DIST_OK) status = disti_gradients_check(ctx, field, grads, name);
+    if (status != DIST_OK || n == 0) return status;
+    if (!points) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: points is NULL", name, 0, 0);
+    if (!d_sdf && (!seed_fn || grads->weights))
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: d_sdf is NULL, needed without seed_fn and for weights", name, 0, 0);
+    if (grads->rotation || grads->translation)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: grads.rotation and grads.translation must be NULL: no camera here", name,
+                          0, 0);
+    size_t size = (size_t)field->code_size;
+    /* one more slot than the pieces use: the total */
+    status = disti_partial_reserve(ctx, size + size / DISTI_SLOTS + 1);
+    if (status != DIST_OK) return status;
+    double *d_code = NULL;
+    if (grads->code) {
+        d_code = ctx->partial + (size_t)DISTI_SLOTS * size;
+        memset(d_code, 0, size * sizeof(double));
+    }
+    if (grads->weights)
+        status = field->weights_fn(field->user, ctx, n, points, d_sdf, seed_fn, seed_user, d_points, d_code, grads->weights);
+    else
+        disti_field_backward_all(ctx, field, n, points, d_sdf, seed_fn, seed_user, d_points, d_code);
+    if (status == DIST_OK && d_code)
+        for (size_t j = 0; j < size; j++) grads->code[j] += (float)d_code[j];
+    return status;
+}
+#endif
+/*@ 05 net ---------------------------------------------------------------------------------------------------------- */
+
+/* The container of a model: safetensors. Eight bytes give the header's length (little-endian), the header is a JSON
+   object name -> {dtype, shape, data_offsets}, and the tensors' bytes follow without overlap or hole, in any alignment.
+   The file is hostile: the header is read twice, first counted and then kept, so that one block of the exact size holds
+   everything: at most 1.7 times the header and 24 bytes for each of DISTI_META_MAX metadata entries. */
+enum { DISTI_DTYPE_OTHER = -1, DISTI_F32 = 0, DISTI_F16, DISTI_BF16 };
+enum { DISTI_META_MAX = 65536, DISTI_HEADER_MAX = 100000000 };
+
+typedef struct disti_tensor {
+    const char *name;          /* unescaped */
+    int dtype;                 /* DISTI_DTYPE_OTHER: well-formed, but not to be read: integers, doubles, rank above 4 */
+    int rank;
+    size_t shape[4];           /* the first four of rank */
+    size_t count;              /* product of the whole shape */
+    size_t bytes;              /* of data */
+    const unsigned char *data; /* in the caller's bytes, unaligned */
+} disti_tensor;
+
+typedef struct disti_archive {
+    disti_tensor *tensors; /* in the header's order */
+    size_t tensor_count;
+    const char **keys;
+    const char **values;
+    size_t meta_count;
+    const void **order; /* the tensors by name */
+    void *block;        /* holds all of the above */
+    size_t block_bytes;
+} disti_archive;
+
+typedef struct disti_reader {
+    dist_context *ctx;
+    const char *function;
+    const char *kind;          /* what a sentence is about: the file, the header, a tensor or a metadata key */
+    const unsigned char *name; /* its name, name_size bytes as they stand in the file, or NULL */
+    size_t name_size;
+    const unsigned char *bytes, *header, *cursor, *end;
+    size_t data_size;
+    disti_archive *archive; /* its block is NULL while counting */
+    size_t tensor_count, meta_count, text_size;
+    char *text;             /* the strings, each with its NUL; NULL while counting */
+    size_t text_bytes;
+} disti_reader;
+
+/* disti_fail with "function: kind "name" " before `what`. A name is cut and cleaned, for it becomes part of the format.
+   Always 0. */
+static int disti_bad(const disti_reader *r, const char *what, const char *text, double a, double b)
+{
+    char format[320];
+    size_t n = 0;
+    for (const char *c = r->function; *c && n < 40; c++) format[n++] = *c;
+    format[n++] = ':';
+    format[n++] = ' ';
+    for (const char *c = r->kind; *c; c++) format[n++] = *c;
+    format[n++] = ' ';
+    if (r->name) {
+        format[n++] = '"';
+        for (size_t i = 0; i < r->name_size && i < 80; i++) {
+            unsigned char c = r->name[i];
+            format[n++] = c >= ' ' && c <= '~' && c != '%' ? (char)c : '?';
+        }
+        format[n++] = '"';
+        format[n++] = ' ';
+    }
+    for (const char *c = what; *c && n + 1 < sizeof format; c++) format[n++] = *c;
+    format[n] = 0;
+    disti_fail(r->ctx, DIST_BAD_FILE, format, text, a, b);
+    return 0;
+}
+
+/* Where the cursor stands, counted from the first byte of the file. */
+static double disti_json_at(const disti_reader *r)
+{
+    return (double)(r->cursor - r->bytes);
+}
+
+static void disti_json_space(disti_reader *r)
+{
+    while (r->cursor < r->end && (*r->cursor == ' ' || *r->cursor == '\n' || *r->cursor == '\r' || *r->cursor == '\t'))
+        r->cursor++;
+}
+
+/* Steps over white space and the character `must`. */
+static int disti_json_expect(disti_reader *r, char must)
+{
+    char text[] = "'?', must be '?'";
+    disti_json_space(r);
+    if (r->cursor < r->end && *r->cursor == (unsigned char)must) {
+        r->cursor++;
+        return 1;
+    }
+    text[14] = must;
+    if (r->cursor == r->end)
+        return disti_bad(r, "is spoiled: the header ends at byte %d, must go on with %s", text + 13,
+                         disti_json_at(r), 0);
+    if (*r->cursor) text[1] = (char)*r->cursor;
+    return disti_bad(r, "is spoiled: byte %d of the file is %s", text, disti_json_at(r), 0);
+}
+
+/* Begins an object or array: 1 an element follows, 0 it is empty, -1 failure. */
+static int disti_json_open(disti_reader *r, char open, char close)
+{
+    if (!disti_json_expect(r, open)) return -1;
+    disti_json_space(r);
+    if (r->cursor == r->end || *r->cursor != (unsigned char)close) return 1;
+    r->cursor++;
+    return 0;
+}
+
+/* After an element: 1 another follows, 0 that was the last, -1 failure. */
+static int disti_json_next(disti_reader *r, char close)
+{
+    disti_json_space(r);
+    if (r->cursor < r->end && *r->cursor == ',') {
+        r->cursor++;
+        return 1;
+    }
+    return disti_json_expect(r, close) ? 0 : -1;
+}
+
+static int disti_json_hex(disti_reader *r, unsigned *out)
+{
+    *out = 0;
+    for (int i = 0; i < 4; i++) {
+        unsigned c = r->cursor < r->end ? *r->cursor : 0;
+        unsigned letter = c | 0x20u;
+        if (c >= '0' && c <= '9') *out = *out * 16 + c - '0';
+        else if (letter >= 'a' && letter <= 'f') *out = *out * 16 + letter - 'a' + 10;
+        else return disti_bad(r, "is spoiled: byte %d of the file must be a hexadecimal digit", NULL,
+                              disti_json_at(r), 0);
+        r->cursor++;
+    }
+    return 1;
+}
+
+/* The escape after a backslash as UTF-8: returns the number of bytes, 0 on failure. */
+static int disti_json_escape(disti_reader *r, unsigned char utf8[4])
+{
+    static const char letters[] = "\"\\/bfnrt", meaning[] = "\"\\/\b\f\n\r\t";
+    unsigned char c = r->cursor < r->end ? *r->cursor : 0;
+    const char *known = (const char *)memchr(letters, c, sizeof letters - 1);
+    if (known) {
+        r->cursor++;
+        utf8[0] = (unsigned char)meaning[known - letters];
+        return 1;
+    }
+    if (c != 'u')
+        return disti_bad(r, "is spoiled: byte %d of the file is no escape of JSON", NULL, disti_json_at(r), 0);
+    unsigned code, low;
+    r->cursor++;
+    if (!disti_json_hex(r, &code)) return 0;
+    if (code >= 0xd800u && code < 0xdc00u && r->end - r->cursor >= 2 && r->cursor[0] == '\\' && r->cursor[1] == 'u') {
+        r->cursor += 2;
+        if (!disti_json_hex(r, &low)) return 0;
+        if (low >= 0xdc00u && low < 0xe000u) code = 0x10000u + ((code - 0xd800u) << 10) + (low - 0xdc00u);
+    }
+    if (code == 0 || (code >= 0xd800u && code < 0xe000u))
+        return disti_bad(r, "is spoiled: the escape before byte %d of the file must not be NUL or half a surrogate "
+                         "pair", NULL, disti_json_at(r), 0);
+    int count = code < 0x80u ? 1 : code < 0x800u ? 2 : code < 0x10000u ? 3 : 4;
+    for (int i = count - 1; i > 0; i--, code >>= 6) utf8[i] = (unsigned char)(0x80u | (code & 0x3fu));
+    utf8[0] = (unsigned char)((count == 1 ? 0u : 0xf00u >> count & 0xffu) | code);
+    return count;
+}
+
+/* A string, unescaped into out (cut to capacity, NUL-terminated; capacity may be 0). *length is that of the whole. */
+static int disti_json_string(disti_reader *r, char *out, size_t capacity, size_t *length)
+{
+    size_t n = 0;
+    if (!disti_json_expect(r, '"')) return 0;
+    for (;;) {
+        unsigned char utf8[4];
+        int count = 1;
+        if (r->cursor == r->end)
+            return disti_bad(r, "is spoiled: a string does not end in the header", NULL, 0, 0);
+        utf8[0] = *r->cursor++;
+        if (utf8[0] == '"') break;
+        if (utf8[0] < 0x20)
+            return disti_bad(r, "is spoiled: control character %d before byte %d of the file must be escaped", NULL,
+                             utf8[0], disti_json_at(r));
+        if (utf8[0] == '\\') count = disti_json_escape(r, utf8);
+        if (count == 0) return 0;
+        for (int i = 0; i < count; i++, n++)
+            if (n + 1 < capacity) out[n] = (char)utf8[i];
+    }
+    if (capacity) out[n < capacity ? n : capacity - 1] = 0;
+    *length = n;
+    return 1;
+}
+
+/* A string that the archive keeps; counting, only its room. */
+static int disti_json_keep(disti_reader *r, const char **kept)
+{
+    size_t length;
+    char *out = r->text ? r->text + r->text_size : NULL;
+    if (!disti_json_string(r, out, r->text ? r->text_bytes - r->text_size : 0, &length)) return 0;
+    r->text_size += length + 1;
+    *kept = out;
+    return 1;
+}
+
+/* A non-negative integer as JSON writes it. */
+static int disti_json_size(disti_reader *r, const char *field, size_t *out)
+{
+    disti_json_space(r);
+    const unsigned char *first = r->cursor;
+    int fits = 1;
+    *out = 0;
+    for (; r->cursor < r->end && *r->cursor >= '0' && *r->cursor <= '9'; r->cursor++)
+        fits = fits && disti_size_mul(*out, 10, out) && disti_size_add(*out, (size_t)(*r->cursor - '0'), out);
+    int more = r->cursor < r->end && (*r->cursor == '.' || *r->cursor == 'e' || *r->cursor == 'E');
+    if (r->cursor == first || more || (*first == '0' && r->cursor - first > 1))
+        return disti_bad(r, "has in %s at byte %d of the file something that is not a plain non-negative integer",
+                         field, (double)(first - r->bytes), 0);
+    if (fits) return 1;
+    return disti_bad(r, "has in %s at byte %d of the file a number that does not fit size_t", field,
+                     (double)(first - r->bytes), 0);
+}
+
+/* An array of integers: how many, the first four, and their product, SIZE_MAX if that does not fit. */
+static int disti_json_sizes(disti_reader *r, const char *field, int *rank, size_t first[4], size_t *product)
+{
+    int fits = 1;
+    *rank = 0;
+    *product = 1;
+    int more = disti_json_open(r, '[', ']');
+    for (; more == 1; more = disti_json_next(r, ']')) {
+        size_t value;
+        if (!disti_json_size(r, field, &value)) return 0;
+        if (*rank < 4) first[*rank] = value;
+        ++*rank;
+        fits = fits && disti_size_mul(*product, value, product);
+    }
+    return more == 0;
+}
+
+/* The dtype's element size, 0 if there is no such dtype. */
+static size_t disti_dtype_size(const char *name, int *dtype)
+{
+    static const struct {
+        const char *name;
+        size_t size;
+        int dtype;
+    } known[] = {{"F32", 4, DISTI_F32}, {"F16", 2, DISTI_F16}, {"BF16", 2, DISTI_BF16},
+                 {"BOOL", 1, -1}, {"U8", 1, -1}, {"I8", 1, -1}, {"F8_E5M2", 1, -1}, {"F8_E4M3", 1, -1}, {"I16", 2, -1},
+                 {"U16", 2, -1}, {"I32", 4, -1}, {"U32", 4, -1}, {"F64", 8, -1}, {"I64", 8, -1}, {"U64", 8, -1}};
+    for (size_t i = 0; i < sizeof known / sizeof known[0]; i++) {
+        if (strcmp(name, known[i].name) != 0) continue;
+        *dtype = known[i].dtype;
+        return known[i].size;
+    }
+    return 0;
+}
+
+/* The value of a tensor's name: exactly dtype, shape and data_offsets, in any order. */
+static int disti_archive_tensor(disti_reader *r, disti_tensor *tensor)
+{
+    static const char *const fields[3] = {"dtype", "shape", "data_offsets"};
+    char text[32];
+    size_t length, offsets[4], product, element = 0;
+    int found[3] = {0, 0, 0}, offset_count = 0;
+    int more = disti_json_open(r, '{', '}');
+    for (; more == 1; more = disti_json_next(r, '}')) {
+        int field = 0;
+        if (!disti_json_string(r, text, sizeof text, &length)) return 0;
+        while (field < 3 && strcmp(text, fields[field]) != 0) field++;
+        if (field == 3)
+            return disti_bad(r, "has the field '%s', must have dtype, shape and data_offsets only", text, 0, 0);
+        if (found[field]++) return disti_bad(r, "has the field %s twice", text, 0, 0);
+        if (!disti_json_expect(r, ':')) return 0;
+        if (field == 0) {
+            if (!disti_json_string(r, text, sizeof text, &length)) return 0;
+            element = disti_dtype_size(text, &tensor->dtype);
+            if (!element) return disti_bad(r, "has the dtype '%s', must be F32, F16 or BF16", text, 0, 0);
+        } else if (field == 1) {
+            if (!disti_json_sizes(r, "shape", &tensor->rank, tensor->shape, &tensor->count)) return 0;
+        } else if (!disti_json_sizes(r, "data_offsets", &offset_count, offsets, &product)) {
+            return 0;
+        }
+    }
+    if (more < 0) return 0;
+    for (int field = 0; field < 3; field++)
+        if (!found[field]) return disti_bad(r, "has no field %s", fields[field], 0, 0);
+    if (offset_count != 2) return disti_bad(r, "has %d data_offsets, must be 2", NULL, offset_count, 0);
+    if (offsets[0] > offsets[1] || offsets[1] > r->data_size)
+        return disti_bad(r, "has data_offsets that end at %d, must be from their begin to %d, the size of the data",
+                         NULL, (double)offsets[1], (double)r->data_size);
+    if (tensor->count == (size_t)-1 || !disti_size_mul(tensor->count, element, &product))
+        return disti_bad(r, "has a shape whose size in bytes does not fit size_t", NULL, 0, 0);
+    if (product != offsets[1] - offsets[0])
+        return disti_bad(r, "has %d bytes by its data_offsets, must be %d by its shape and dtype", NULL,
+                         (double)(offsets[1] - offsets[0]), (double)product);
+    if (tensor->rank > 4) tensor->dtype = DISTI_DTYPE_OTHER;
+    tensor->bytes = product;
+    tensor->data = r->end + offsets[0];
+    return 1;
+}
+
+/* What the sentences are about from here on. */
+static void disti_archive_about(disti_reader *r, const char *kind, const void *name, size_t name_size)
+{
+    r->kind = kind;
+    r->name = (const unsigned char *)name;
+    r->name_size = name_size;
+}
+
+/* A name and its colon. */
+static int disti_archive_name(disti_reader *r, const char *kind, const char **kept)
+{
+    disti_archive_about(r, "the header", NULL, 0);
+    disti_json_space(r);
+    const unsigned char *first = r->cursor;
+    if (!disti_json_keep(r, kept)) return 0;
+    disti_archive_about(r, kind, first + 1, (size_t)(r->cursor - first) - 2);
+    return disti_json_expect(r, ':');
+}
+
+static int disti_archive_metadata(disti_reader *r)
+{
+    int more = disti_json_open(r, '{', '}');
+    for (; more == 1; more = disti_json_next(r, '}')) {
+        const char *key, *value;
+        if (!disti_archive_name(r, "metadata key", &key) || !disti_json_keep(r, &value)) return 0;
+        if (r->meta_count == DISTI_META_MAX)
+            return disti_bad(r, "is one too many, there must be at most %d", NULL, DISTI_META_MAX, 0);
+        if (r->text) {
+            r->archive->keys[r->meta_count] = key;
+            r->archive->values[r->meta_count] = value;
+        }
+        r->meta_count++;
+    }
+    return more == 0;
+}
+
+/* One pass over the header: counts and checks, and keeps where there is room. */
+static int disti_archive_pass(disti_reader *r)
+{
+    int metadata = 0;
+    r->cursor = r->header;
+    r->tensor_count = r->meta_count = r->text_size = 0;
+    disti_archive_about(r, "the header", NULL, 0);
+    int more = disti_json_open(r, '{', '}');
+    for (; more == 1; more = disti_json_next(r, '}')) {
+        char name[32];
+        size_t length;
+        disti_archive_about(r, "the header", NULL, 0);
+        const unsigned char *first = r->cursor;
+        if (!disti_json_string(r, name, sizeof name, &length)) return 0;
+        if (strcmp(name, "__metadata__") == 0) {
+            if (metadata++) return disti_bad(r, "has __metadata__ twice", NULL, 0, 0);
+            if (!disti_json_expect(r, ':') || !disti_archive_metadata(r)) return 0;
+            continue;
+        }
+        disti_tensor counted;
+        disti_tensor *tensor = r->text ? &r->archive->tensors[r->tensor_count] : &counted;
+        r->cursor = first;
+        if (!disti_archive_name(r, "tensor", &tensor->name) || !disti_archive_tensor(r, tensor)) return 0;
+        r->tensor_count++;
+    }
+    if (more < 0) return 0;
+    disti_archive_about(r, "the header", NULL, 0);
+    disti_json_space(r);
+    if (r->cursor == r->end) return 1;
+    return disti_bad(r, "goes on at byte %d of the file, must have only spaces after its object", NULL,
+                     disti_json_at(r), 0);
+}
+
+/* Heapsort: n log n whatever the file says, and no memory; qsort promises neither. */
+static void disti_sort(size_t n, const void **items, int (*compare_fn)(const void *a, const void *b))
+{
+    for (size_t start = n / 2, end = n; end > 1;) {
+        const void *item;
+        if (start > 0) {
+            item = items[--start];
+        } else {
+            item = items[--end];
+            items[end] = items[0];
+        }
+        size_t root = start;
+        for (size_t child = 2 * root + 1; child < end; child = 2 * root + 1) {
+            if (child + 1 < end && compare_fn(items[child], items[child + 1]) < 0) child++;
+            if (compare_fn(item, items[child]) >= 0) break;
+            items[root] = items[child];
+            root = child;
+        }
+        items[root] = item;
+    }
+}
+
+static int disti_compare_text(const void *a, const void *b)
+{
+    return strcmp((const char *)a, (const char *)b);
+}
+
+static int disti_compare_name(const void *a, const void *b)
+{
+    return strcmp(((const disti_tensor *)a)->name, ((const disti_tensor *)b)->name);
+}
+
+static int disti_compare_data(const void *a, const void *b)
+{
+    const disti_tensor *x = (const disti_tensor *)a, *y = (const disti_tensor *)b;
+    if (x->data != y->data) return x->data < y->data ? -1 : 1;
+    return x->bytes < y->bytes ? -1 : x->bytes > y->bytes;
+}
+
+/* What no single entry shows: names that stand twice, overlaps, holes. Leaves the order by name. */
+static int disti_archive_check(disti_reader *r)
+{
+    disti_archive *archive = r->archive;
+    const void **order = archive->order;
+    for (size_t i = 0; i < archive->meta_count; i++) order[i] = archive->keys[i];
+    disti_sort(archive->meta_count, order, disti_compare_text);
+    for (size_t i = 1; i < archive->meta_count; i++) {
+        if (disti_compare_text(order[i - 1], order[i]) != 0) continue;
+        disti_archive_about(r, "metadata key", order[i], strlen((const char *)order[i]));
+        return disti_bad(r, "stands in the header twice", NULL, 0, 0);
+    }
+    for (size_t i = 0; i < archive->tensor_count; i++) order[i] = &archive->tensors[i];
+    disti_sort(archive->tensor_count, order, disti_compare_data);
+    const unsigned char *next = r->end;
+    for (size_t i = 0; i < archive->tensor_count; i++) {
+        const disti_tensor *tensor = (const disti_tensor *)order[i];
+        disti_archive_about(r, "tensor", tensor->name, strlen(tensor->name));
+        if (tensor->data != next)
+            return disti_bad(r, "leaves %s: its data_offsets begin at %d, must begin at %d",
+                             tensor->data < next ? "an overlap" : "a hole", (double)(tensor->data - r->end),
+                             (double)(next - r->end));
+        next += tensor->bytes;
+    }
+    disti_archive_about(r, "the file", NULL, 0);
+    if (next != r->end + r->data_size)
+        return disti_bad(r, "has %d bytes of data, must have %d for its tensors", NULL, (double)r->data_size,
+                         (double)(next - r->end));
+    disti_sort(archive->tensor_count, order, disti_compare_name);
+    for (size_t i = 1; i < archive->tensor_count; i++) {
+        if (disti_compare_name(order[i - 1], order[i]) != 0) continue;
+        const char *name = ((const disti_tensor *)order[i])->name;
+        disti_archive_about(r, "tensor", name, strlen(name));
+        return disti_bad(r, "stands in the header twice", NULL, 0, 0);
+    }
+    return 1;
+}
+
+/* The first byte that is not UTF-8 (nor is a code too long, above 10ffff or half a surrogate pair), or the end. */
+static const unsigned char *disti_utf8_end(const unsigned char *c, const unsigned char *end)
+{
+    while (c < end) {
+        int more = *c < 0x80 ? 0 : *c < 0xc2 ? -1 : *c < 0xe0 ? 1 : *c < 0xf0 ? 2 : *c < 0xf5 ? 3 : -1;
+        if (more < 0 || more >= end - c) return c;
+        for (int i = 1; i <= more; i++)
+            if ((c[i] & 0xc0) != 0x80) return c;
+        if ((*c == 0xe0 && c[1] < 0xa0) || (*c == 0xed && c[1] > 0x9f)) return c;
+        if ((*c == 0xf0 && c[1] < 0x90) || (*c == 0xf4 && c[1] > 0x8f)) return c;
+        c += more + 1;
+    }
+    return c;
+}
+
+/* Finds header and data. What is not safetensors at all is named, where its first bytes tell. */
+static int disti_archive_header(disti_reader *r, size_t size)
+{
+    static const char *const others[5][2] = {
+        {"PK\3\4", "a PyTorch checkpoint (zip)"}, {"\x80", "a PyTorch checkpoint (pickle)"}, {"GGUF", "a GGUF file"},
+        {"\x93NUMPY", "a numpy file"}, {"\x89HDF", "an HDF5 file"}};
+    uint64_t length = 0;
+    for (size_t i = 0; i < 8 && i < size; i++) length |= (uint64_t)r->bytes[i] << 8 * i;
+    for (int i = 0; i < 5; i++)
+        if ((size < 10 || length > DISTI_HEADER_MAX) && size >= strlen(others[i][0]) &&
+            memcmp(r->bytes, others[i][0], strlen(others[i][0])) == 0)
+            return disti_bad(r, "is %s, must be safetensors: save the state_dict with safetensors", others[i][1], 0, 0);
+    if (size < 10) return disti_bad(r, "has %d bytes, a safetensors file has at least 10", NULL, (double)size, 0);
+    size_t most = DISTI_MIN(size - 8, (size_t)DISTI_HEADER_MAX);
+    if (length < 2 || length > most)
+        return disti_bad(r, "has a header length of %d, must be 2 to %d", NULL, (double)length, (double)most);
+    r->header = r->bytes + 8;
+    r->end = r->header + (size_t)length;
+    r->data_size = size - 8 - (size_t)length;
+    if (r->header[0] != '{') return disti_bad(r, "has byte %d at 8, must be %d: a '{'", NULL, r->header[0], '{');
+    r->cursor = disti_utf8_end(r->header, r->end);
+    if (r->cursor == r->end) return 1;
+    return disti_bad(r, "has a header that is not UTF-8 at byte %d", NULL, disti_json_at(r), 0);
+}
+
+/* Safe on a zeroed archive and on one that failed. */
+static void disti_archive_close(dist_context *ctx, disti_archive *archive)
+{
+    disti_free(ctx, archive->block, archive->block_bytes);
+    memset(archive, 0, sizeof *archive);
+}
+
+/* bytes (size) are borrowed until disti_archive_close and must not change. Sentences start with `function`.
+   The archive needs no closing after a failure. */
+static dist_status disti_archive_open(dist_context *ctx, const char *function, const void *bytes, size_t size,
+                                      disti_archive *archive)
+{
+    disti_reader r;
+    memset(&r, 0, sizeof r);
+    memset(archive, 0, sizeof *archive);
+    r.ctx = ctx;
+    r.function = function;
+    r.kind = "the file";
+    r.bytes = (const unsigned char *)bytes;
+    r.archive = archive;
+    if (!disti_archive_header(&r, size) || !disti_archive_pass(&r)) return DIST_BAD_FILE;
+    size_t tensors, pairs, order, total;
+    disti_size_mul(r.tensor_count, sizeof(disti_tensor), &tensors);
+    disti_size_mul(r.meta_count, 2 * sizeof(char *), &pairs);
+    disti_size_mul(DISTI_MAX(r.tensor_count, r.meta_count), sizeof(void *), &order);
+    disti_size_add(tensors, pairs, &total);
+    disti_size_add(total, order, &total);
+    disti_size_add(total, r.text_size, &total);
+    unsigned char *block = (unsigned char *)disti_alloc(ctx, total);
+    if (!block) return DIST_OUT_OF_MEMORY;
+    archive->block = block;
+    archive->block_bytes = total;
+    archive->tensors = (disti_tensor *)(void *)block;
+    archive->keys = (const char **)(void *)(block + tensors);
+    archive->values = archive->keys + r.meta_count;
+    archive->order = (const void **)(void *)(block + tensors + pairs);
+    archive->tensor_count = r.tensor_count;
+    archive->meta_count = r.meta_count;
+    r.text = (char *)block + tensors + pairs + order;
+    r.text_bytes = r.text_size;
+    if (disti_archive_pass(&r) && disti_archive_check(&r)) return DIST_OK;
+    disti_archive_close(ctx, archive);
+    return DIST_BAD_FILE;
+}
+
+/* NULL if there is none. */
+static const disti_tensor *disti_archive_find(const disti_archive *archive, const char *name)
+{
+    size_t first = 0, count = archive->tensor_count;
+    while (count > 0) {
+        const disti_tensor *tensor = (const disti_tensor *)archive->order[first + count / 2];
+        int side = strcmp(name, tensor->name);
+        if (side == 0) return tensor;
+        if (side > 0) first += count / 2 + 1;
+        count = side > 0 ? count - count / 2 - 1 : count / 2;
+    }
+    return NULL;
+}
+
+static const char *disti_archive_meta(const disti_archive *archive, const char *key)
+{
+    for (size_t i = 0; i < archive->meta_count; i++)
+        if (strcmp(archive->keys[i], key) == 0) return archive->values[i];
+    return NULL;
+}
+
+/* An IEEE half as the bits of the float of the same value. */
+static uint32_t disti_half_bits(uint32_t half)
+{
+    uint32_t sign = (half & 0x8000u) << 16, exponent = half >> 10 & 31u, fraction = half & 0x3ffu, bits;
+    if (exponent == 31) return sign | 0x7f800000u | fraction << 13;
+    if (exponent > 0) return sign | (exponent + 112) << 23 | fraction << 13;
+    float value = (float)fraction * 5.9604644775390625e-8f; /* 2^-24, the unit of subnormal halves */
+    memcpy(&bits, &value, sizeof bits);
+    return sign | bits;
+}
+
+/* The numbers (count) as floats, bit by bit where they are F32. A tensor of DISTI_DTYPE_OTHER leaves out as it is. */
+static void disti_tensor_read(const disti_tensor *tensor, float *out)
+{
+    const unsigned char *p = tensor->data;
+    if (tensor->dtype == DISTI_DTYPE_OTHER) return;
+    for (size_t i = 0; i < tensor->count; i++) {
+        uint32_t bits = p[0] | (uint32_t)p[1] << 8;
+        if (tensor->dtype == DISTI_F32) bits |= (uint32_t)p[2] << 16 | (uint32_t)p[3] << 24;
+        else bits = tensor->dtype == DISTI_F16 ? disti_half_bits(bits) : bits << 16;
+        memcpy(out + i, &bits, sizeof bits);
+        p += tensor->dtype == DISTI_F32 ? 4 : 2;
+    }
+}
+
+/* mantissa * 10^exponent as the bits of the nearest double, in whole numbers: no rounding mode, flag or flushing of the
+   caller's touches it. sticky: digits that are not zero were cut off behind mantissa. 0 if it is too large. */
+static int disti_decimal(uint64_t mantissa, int64_t exponent, int sticky, uint64_t *bits)
+{
+    uint32_t w[64]; /* little-endian; the value is w * 2^base, with room below to divide in and above to multiply in */
+    *bits = 0;
+    if (mantissa == 0 || exponent < -400) return 1;
+    if (exponent > 310) return 0;
+    int left = exponent < 0 ? -(int)exponent : (int)exponent;
+    int words = exponent < 0 ? 5 + left * 107 / 1024 : 4; /* log2(10) / 32 < 107 / 1024 */
+    int base = -32 * (words - 2);
+    memset(w, 0, sizeof w);
+    w[words - 2] = (uint32_t)mantissa;
+    w[words - 1] = (uint32_t)(mantissa >> 32);
+    while (left > 0) {
+        uint64_t power = 1, carry = 0;
+        for (int i = 0; i < 9 && left > 0; i++, left--) power *= 10;
+        for (int i = words - 1; i >= 0 && exponent < 0; i--) {
+            carry = carry << 32 | w[i];
+            w[i] = (uint32_t)(carry / power);
+            carry %= power;
+        }
+        for (int i = 0; i < words && exponent > 0; i++) {
+            carry += w[i] * power;
+            w[i] = (uint32_t)carry;
+            carry >>= 32;
+        }
+        if (exponent < 0) sticky |= carry != 0;
+        else if (carry) w[words++] = (uint32_t)carry;
+    }
+    int top = words - 1, shift = 0;
+    while (w[top] == 0) top--;
+    uint64_t head = (uint64_t)w[top] << 32 | w[top - 1];
+    for (; head >> 63 == 0; shift++) head <<= 1;
+    head |= shift ? w[top - 2] >> (32 - shift) : 0;
+    sticky |= (uint32_t)((uint64_t)w[top - 2] << shift) != 0;
+    for (int i = 0; i < top - 2; i++) sticky |= w[i] != 0;
+    int binary = 32 * top + 31 - shift + base; /* 2^binary is the first digit of head */
+    int kept = binary >= -1022 ? 53 : 53 - (-1022 - binary);
+    if (binary > 1023) return 0;
+    if (kept < 0) return 1;
+    uint64_t whole = kept ? head >> (64 - kept) : 0, rest = head << kept, half = (uint64_t)1 << 63;
+    whole += rest > half || (rest == half && (sticky || (whole & 1)));
+    *bits = whole + (binary >= -1022 ? (uint64_t)(binary + 1022) << 52 : 0);
+    return *bits < 0x7ff0000000000000u;
+}
+
+static int disti_digit(const char *c, const char *end)
+{
+    return c < end && *c >= '0' && *c <= '9';
+}
+
+/* [+-]digits[.digits][e[+-]digits] in any locale: 1 and *cursor behind it, or 0 and nothing changed. Rounded to the
+   nearest double for up to 19 digits; too small is 0, too large is refused, and so is what is not a number. */
+static int disti_parse_double(const char **cursor, const char *end, double *out)
+{
+    const char *c = *cursor;
+    int negative = c < end && *c == '-', point = 0, cut = 0;
+    uint64_t mantissa = 0, bits;
+    int64_t exponent = 0;
+    if (c < end && (*c == '-' || *c == '+')) c++;
+    if (!disti_digit(c, end)) return 0;
+    for (; disti_digit(c, end) || (!point && c < end && *c == '.' && disti_digit(c + 1, end)); c++) {
+        if (*c == '.') {
+            point = 1;
+        } else if (mantissa < 1000000000000000000u) {
+            mantissa = mantissa * 10 + (uint64_t)(*c - '0');
+            exponent -= point;
+        } else {
+            cut |= *c != '0';
+            exponent += !point;
+        }
+    }
+    if (c < end && (*c == 'e' || *c == 'E')) {
+        const char *e = c + 1;
+        int64_t power = 0;
+        int minus = e < end && *e == '-';
+        if (e < end && (*e == '-' || *e == '+')) e++;
+        if (disti_digit(e, end)) {
+            for (; disti_digit(e, end); e++)
+                if (power < 1000000000000000) power = power * 10 + (*e - '0');
+            exponent += minus ? -power : power;
+            c = e;
+        }
+    }
+    if (!disti_decimal(mantissa, exponent, cut, &bits)) return 0;
+    bits |= (uint64_t)negative << 63;
+    memcpy(out, &bits, sizeof bits);
+    *cursor = c;
+    return 1;
+}
+
+typedef struct disti_tensor_out {
+    const char *name;
+    int rank;
+    size_t shape[4];
+    const float *data;
+} disti_tensor_out;
+
+typedef struct disti_writer {
+    unsigned char *out; /* NULL: only counted */
+    size_t size;        /* SIZE_MAX if it does not fit */
+} disti_writer;
+
+static void disti_put(disti_writer *w, const void *bytes, size_t size)
+{
+    if (w->out) memcpy(w->out + w->size, bytes, size);
+    disti_size_add(w->size, size, &w->size);
+}
+
+static void disti_put_text(disti_writer *w, const char *text)
+{
+    disti_put(w, text, strlen(text));
+}
+
+static void disti_put_size(disti_writer *w, size_t value)
+{
+    char digits[24];
+    size_t n = sizeof digits;
+    do digits[--n] = (char)('0' + value % 10);
+    while (value /= 10);
+    disti_put(w, digits + n, sizeof digits - n);
+}
+
+/* In quotes, escaped. */
+static void disti_put_string(disti_writer *w, const char *text)
+{
+    disti_put(w, "\"", 1);
+    for (; *text; text++) {
+        unsigned char c = (unsigned char)*text;
+        char escape[6] = {'\\', 'u', '0', '0', 0, 0};
+        escape[4] = (char)('0' + (c >> 4));
+        escape[5] = "0123456789abcdef"[c & 15];
+        if (c < 0x20) disti_put(w, escape, 6);
+        if (c == '"' || c == '\\') disti_put(w, "\\", 1);
+        if (c >= 0x20) disti_put(w, text, 1);
+    }
+    disti_put(w, "\"", 1);
+}
+
+/* SIZE_MAX if it does not fit. */
+static size_t disti_tensor_out_bytes(const disti_tensor_out *tensor)
+{
+    size_t bytes = sizeof(float);
+    for (int i = 0; i < tensor->rank; i++)
+        if (!disti_size_mul(bytes, tensor->shape[i], &bytes)) return (size_t)-1;
+    return bytes;
+}
+
+/* Returns the size of the data. */
+static size_t disti_put_header(disti_writer *w, size_t tensor_count, const disti_tensor_out *tensors, size_t meta_count,
+                               const char *const *keys, const char *const *values)
+{
+    size_t offset = 0;
+    disti_put_text(w, meta_count ? "{\"__metadata__\":{" : "{");
+    for (size_t i = 0; i < meta_count; i++) {
+        if (i) disti_put_text(w, ",");
+        disti_put_string(w, keys[i]);
+        disti_put_text(w, ":");
+        disti_put_string(w, values[i]);
+    }
+    if (meta_count) disti_put_text(w, "}");
+    for (size_t i = 0; i < tensor_count; i++) {
+        if (i || meta_count) disti_put_text(w, ",");
+        disti_put_string(w, tensors[i].name);
+        disti_put_text(w, ":{\"dtype\":\"F32\",\"shape\":[");
+        for (int k = 0; k < tensors[i].rank; k++) {
+            if (k) disti_put_text(w, ",");
+            disti_put_size(w, tensors[i].shape[k]);
+        }
+        disti_put_text(w, "],\"data_offsets\":[");
+        disti_put_size(w, offset);
+        disti_size_add(offset, disti_tensor_out_bytes(&tensors[i]), &offset);
+        disti_put_text(w, ",");
+        disti_put_size(w, offset);
+        disti_put_text(w, "]}");
+    }
+    disti_put_text(w, "}");
+    return offset;
+}
+
+/* Writes metadata and tensors in the order given, all F32; the same input gives the same bytes. Names and keys are
+   UTF-8 and none stands twice. *size is always set, to 0 where nothing can be written; with buffer NULL that is all. */
+static dist_status disti_archive_write(dist_context *ctx, const char *function, size_t tensor_count,
+                                       const disti_tensor_out *tensors, size_t meta_count, const char *const *keys,
+                                       const char *const *values, void *buffer, size_t capacity, size_t *size)
+{
+    disti_writer w;
+    w.out = NULL;
+    w.size = 8;
+    *size = 0;
+    size_t data = disti_put_header(&w, tensor_count, tensors, meta_count, keys, values), total;
+    if (w.size > DISTI_HEADER_MAX)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: names and metadata have %d bytes, must be at most %d", function,
+                          (double)w.size, DISTI_HEADER_MAX);
+    size_t begin = (w.size + 7) / 8 * 8; /* so that a reader may map the floats where they lie */
+    if (!disti_size_add(begin, data, &total) || total == (size_t)-1)
+        return disti_fail(ctx, DIST_OUT_OF_MEMORY, "%s: the tensors' size does not fit size_t", function, 0, 0);
+    *size = total;
+    if (!buffer) return DIST_OK;
+    if (capacity < total)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: capacity is %d, must be at least %d", function, (double)capacity,
+                          (double)total);
+    w.out = (unsigned char *)buffer;
+    w.size = 8;
+    for (size_t i = 0; i < 8; i++) w.out[i] = (unsigned char)((uint64_t)(begin - 8) >> 8 * i);
+    disti_put_header(&w, tensor_count, tensors, meta_count, keys, values);
+    while (w.size < begin) disti_put(&w, " ", 1);
+    for (size_t i = 0; i < tensor_count; i++) {
+        size_t count = disti_tensor_out_bytes(&tensors[i]) / sizeof(float);
+        for (size_t k = 0; k < count; k++) {
+            uint32_t bits;
+            memcpy(&bits, tensors[i].data + k, sizeof bits);
+            unsigned char le[4] = {(unsigned char)bits, (unsigned char)(bits >> 8), (unsigned char)(bits >> 16),
+                                   (unsigned char)(bits >> 24)};
+            disti_put(&w, le, 4);
+        }
+    }
+    return DIST_OK;
+}
+
+enum { DISTI_MAX_LAYERS = 32, DISTI_MAX_WIDTH = 8192, DISTI_MAX_LEVELS = 16, DISTI_MAX_CHANNELS = 16 };
+enum { DISTI_OUTPUT_NONE, DISTI_OUTPUT_TANH, DISTI_OUTPUT_SIGMOID, DISTI_OUTPUT_TANH_TWICE };
+enum { DISTI_ORDER_SIN_COS, DISTI_ORDER_COS_ALL, DISTI_ORDER_SIN_ALL };
+
+/* One linear layer. Its rows, as the kernels see them, are the previous layer's units (`prev`), then, in layer 0 and in
+   skip layers, the encoded point (`point`); the code's columns are folded into the bias. */
+typedef struct disti_linear {
+    int in, out;      /* as in the file */
+    int prev, point;  /* rows = prev + point */
+    int code;         /* columns of the code: code_size or 0 */
+    int x_column, point_column, code_column; /* where they start in the file's columns */
+    float scale;      /* on all columns: a skip layer's skip_scale, else 1 */
+    size_t weight, bias, norm_weight, norm_bias; /* offsets into params */
+    size_t panel;     /* offset into panels; the last layer's is plain (out, rows) */
+} disti_linear;
+
+struct dist_net {
+    dist_allocator allocator;
+    int layers; /* linear layers, the last included */
+    int code_size, code_count;
+    int channels, sdf_channel, color_channel; /* -1: none; color_channel: the first of r, g, b */
+    int activation, output, normed;
+    float first_scale, scale;
+    int point_first;      /* input is [point, code], not [code, point] */
+    int skip_input_first; /* skip layers see [input, x], not [x, input] */
+    int levels, raw, order, point_size;
+    double base;
+    float norm_epsilon, level, bound, clamp;
+    int max_rows; /* largest rows or out of a layer, rounded up to 8 */
+    int fold_count; /* layers that see the code */
+    disti_linear layer[DISTI_MAX_LAYERS];
+    float *params, *panels, *codes;
+    size_t param_count, panel_count;
+    char channel_names[DISTI_MAX_CHANNELS][8];
+};
+
+struct dist_shape {
+    dist_context *ctx;
+    const dist_net *net;
+    float *code;
+    float *bias; /* (layers, max_rows): each layer's bias with the code folded in */
+    float lipschitz;
+    float *store; /* activations and deltas of store_blocks blocks, for weight gradients */
+    size_t store_block_size;
+    int store_blocks;
+};
+
+/* Memory of one block on its way through the net, laid out in the worker's scratch. */
+typedef struct disti_block {
+    float *point;      /* (point_size, B): the encoded point */
+    float *d_point;    /* its gradient */
+    float *act[2];     /* (max_rows, B): a layer's input */
+    float *delta[2];   /* (max_rows, B): dL/d(pre-activation) */
+    float *fold_delta; /* (fold_count, max_rows, B): that of the layers that see the code, kept until the seeds are known */
+    uint64_t *mask;    /* (layers, max_rows): which lanes of a layer's input rows are alive */
+    int *alive;        /* (layers, max_rows): rows of a layer's input that are alive anywhere in the block */
+    float *slope;      /* (layers, max_rows, B): activation's derivative; not for ReLU */
+    float *hat;        /* (layers, max_rows, B): LayerNorm's normalized values */
+    float *inverse;    /* (layers, B): and its 1 / sigma */
+    double *fold_sum;  /* (fold_count, max_rows) */
+    float *tail;       /* (8, B): sdf, slope of the output, seed, scratch; (3 B): gradient */
+    int alive_count[DISTI_MAX_LAYERS];
+    int alive_units[DISTI_MAX_LAYERS]; /* of them, units: those before the encoded point's rows */
+    int columns;
+} disti_block;
+
+static void *disti_take(unsigned char *base, size_t *at, size_t count, size_t size)
+{
+    size_t bytes = (count * size + DISTI_ALIGNMENT - 1) & ~(size_t)(DISTI_ALIGNMENT - 1); /* small factors: cannot overflow */
+    unsigned char *p = base ? base + *at : NULL;
+    *at += bytes;
+    return p;
+}
+
+/* Returns the bytes needed; base NULL: only that. Sizes are bounded by 32 layers of 8192 + 99 rows. */
+static size_t disti_block_layout(const dist_net *net, unsigned char *base, disti_block *b)
+{
+    size_t at = 0, rows = (size_t)net->max_rows, layers = (size_t)net->layers, row = DISTI_BLOCK * sizeof(float);
+    size_t point = ((size_t)net->point_size + 7) & ~(size_t)7;
+    memset(b, 0, sizeof *b);
+    b->point = (float *)disti_take(base, &at, point, row);
+    b->d_point = (float *)disti_take(base, &at, point, row);
+    for (int i = 0; i < 2; i++) {
+        b->act[i] = (float *)disti_take(base, &at, rows, row);
+        b->delta[i] = (float *)disti_take(base, &at, rows, row);
+    }
+    b->fold_delta = (float *)disti_take(base, &at, (size_t)net->fold_count * rows, row);
+    b->mask = (uint64_t *)disti_take(base, &at, layers * rows, sizeof(uint64_t));
+    b->alive = (int *)disti_take(base, &at, layers * rows, sizeof(int));
+    if (net->activation != DIST_ACTIVATION_RELU) b->slope = (float *)disti_take(base, &at, layers * rows, row);
+    if (net->normed) {
+        b->hat = (float *)disti_take(base, &at, layers * rows, row);
+        b->inverse = (float *)disti_take(base, &at, layers, row);
+    }
+    b->fold_sum = (double *)disti_take(base, &at, (size_t)net->fold_count * rows, sizeof(double));
+    b->tail = (float *)disti_take(base, &at, 11, row);
+    return at;
+}
+
+/* What weight gradients need of each layer, one block's share of the store: the input transposed (B, stride) and scaled, the
+   pre-activation's delta (out8, B), and the sums for LayerNorm's gamma and beta (out8 each). */
+static size_t disti_store_stride(const disti_linear *layer)
+{
+    return ((size_t)(layer->prev + layer->point) + 15) & ~(size_t)15;
+}
+
+static size_t disti_store_out(const disti_linear *layer)
+{
+    return ((size_t)layer->out + 15) & ~(size_t)15;
+}
+
+enum { DISTI_STORE_INPUT, DISTI_STORE_DELTA, DISTI_STORE_NORM };
+
+/* Offset of one of the three for layer l; l = layers: the size of the whole. */
+static size_t disti_store_offset(const dist_net *net, int l, int part)
+{
+    size_t at = 0;
+    for (int i = 0; i < l; i++)
+        at += disti_store_stride(&net->layer[i]) * DISTI_BLOCK + disti_store_out(&net->layer[i]) * (DISTI_BLOCK + 2);
+    if (part >= DISTI_STORE_DELTA) at += disti_store_stride(&net->layer[l]) * DISTI_BLOCK;
+    if (part >= DISTI_STORE_NORM) at += disti_store_out(&net->layer[l]) * DISTI_BLOCK;
+    return at;
+}
+
+/* forward   raw: p;  level k: sin(b 2^k p), cos(b 2^k p)    in double by doubling the angle: sin 2a = 2 sin a cos a,
+             cos 2a = 1 - 2 sin^2 a, so that float rounding of large angles does not enter
+   The row of (level, axis, sine or cosine) depends on the order. */
+static int disti_encoding_row(const dist_net *net, int level, int axis, int cosine)
+{
+    int first = net->raw ? 3 : 0, half = 3 * net->levels;
+    if (net->order == DISTI_ORDER_SIN_COS) return first + 6 * level + (cosine ? 3 : 0) + axis;
+    int second = net->order == DISTI_ORDER_COS_ALL ? !cosine : cosine;
+    return first + (second ? half : 0) + 3 * level + axis;
+}
+
+static void disti_encode(const dist_net *net, size_t n, const float *points, float *rows)
+{
+    for (size_t c = 0; c < DISTI_BLOCK; c++) {
+        const float *p = points + 3 * (c < n ? c : n - 1); /* idle lanes repeat the last point: no unit lives for them alone */
+        for (int axis = 0; axis < 3; axis++) {
+            double s, co;
+            if (net->raw) rows[(size_t)axis * DISTI_BLOCK + c] = p[axis];
+            if (net->levels == 0) continue;
+            disti_sincos(net->base * (double)p[axis], &s, &co);
+            for (int k = 0; k < net->levels; k++) {
+                rows[(size_t)disti_encoding_row(net, k, axis, 0) * DISTI_BLOCK + c] = (float)s;
+                rows[(size_t)disti_encoding_row(net, k, axis, 1) * DISTI_BLOCK + c] = (float)co;
+                double twice = 2.0 * s * co;
+                co = 1.0 - 2.0 * s * s;
+                s = twice;
+            }
+        }
+    }
+}
+
+/* backward  d_p = d_raw + sum_k b 2^k (cos(b 2^k p) d_sin_k - sin(b 2^k p) d_cos_k) */
+static void disti_encode_backward(const dist_net *net, const float *rows, const float *d_rows, float *d_points)
+{
+    for (size_t c = 0; c < DISTI_BLOCK; c++) {
+        for (int axis = 0; axis < 3; axis++) {
+            float sum = net->raw ? d_rows[(size_t)axis * DISTI_BLOCK + c] : 0.0f;
+            float factor = (float)net->base;
+            for (int k = 0; k < net->levels; k++) {
+                size_t s = (size_t)disti_encoding_row(net, k, axis, 0) * DISTI_BLOCK + c;
+                size_t co = (size_t)disti_encoding_row(net, k, axis, 1) * DISTI_BLOCK + c;
+                sum += factor * (rows[co] * d_rows[s] - rows[s] * d_rows[co]);
+                factor *= 2.0f;
+            }
+            d_points[3 * c + (size_t)axis] = sum;
+        }
+    }
+}
+
+/* forward   mu = mean_u x, v = mean_u (x - mu)^2, hat = (x - mu) / sqrt(v + eps), y = gamma hat + beta     for each lane */
+static void disti_norm(int units, float epsilon, const float *gamma, const float *beta, float *x, float *hat, float *inverse)
+{
+    float mean[DISTI_BLOCK], variance[DISTI_BLOCK];
+    size_t count = (size_t)units;
+    for (size_t c = 0; c < DISTI_BLOCK; c++) mean[c] = variance[c] = 0.0f;
+    for (size_t u = 0; u < count; u++)
+        for (size_t c = 0; c < DISTI_BLOCK; c++) mean[c] += x[u * DISTI_BLOCK + c];
+    for (size_t c = 0; c < DISTI_BLOCK; c++) mean[c] /= (float)units;
+    for (size_t u = 0; u < count; u++) {
+        for (size_t c = 0; c < DISTI_BLOCK; c++) {
+            float d = x[u * DISTI_BLOCK + c] - mean[c];
+            hat[u * DISTI_BLOCK + c] = d;
+            variance[c] += d * d;
+        }
+    }
+    for (size_t c = 0; c < DISTI_BLOCK; c++) inverse[c] = 1.0f / sqrtf(variance[c] / (float)units + epsilon);
+    for (size_t u = 0; u < count; u++) {
+        for (size_t c = 0; c < DISTI_BLOCK; c++) {
+            float h = hat[u * DISTI_BLOCK + c] * inverse[c];
+            hat[u * DISTI_BLOCK + c] = h;
+            x[u * DISTI_BLOCK + c] = gamma[u] * h + beta[u];
+        }
+    }
+}
+
+/* backward  g = gamma d_y,  d_x = (g - mean_u g - hat mean_u (g hat)) / sqrt(v + eps)                    in place: d is d_y, then d_x */
+static void disti_norm_backward(int units, const float *gamma, const float *hat, const float *inverse, float *d)
+{
+    float mean[DISTI_BLOCK], along[DISTI_BLOCK];
+    size_t count = (size_t)units;
+    for (size_t c = 0; c < DISTI_BLOCK; c++) mean[c] = along[c] = 0.0f;
+    for (size_t u = 0; u < count; u++) {
+        for (size_t c = 0; c < DISTI_BLOCK; c++) {
+            float g = d[u * DISTI_BLOCK + c] * gamma[u];
+            d[u * DISTI_BLOCK + c] = g;
+            mean[c] += g;
+            along[c] += g * hat[u * DISTI_BLOCK + c];
+        }
+    }
+    for (size_t u = 0; u < count; u++)
+        for (size_t c = 0; c < DISTI_BLOCK; c++)
+            d[u * DISTI_BLOCK + c] = (d[u * DISTI_BLOCK + c] - mean[c] / (float)units -
+                                      hat[u * DISTI_BLOCK + c] * (along[c] / (float)units)) * inverse[c];
+}
+
+/* Bits of the positive lanes of each row. */
+static void disti_positive(size_t rows, const float *y, uint64_t *mask)
+{
+    for (size_t u = 0; u < rows; u++) {
+        uint64_t bits = 0;
+        for (size_t c = 0; c < DISTI_BLOCK; c++) bits |= (uint64_t)(y[u * DISTI_BLOCK + c] > 0.0f) << c;
+        mask[u] = bits;
+    }
+}
+
+/* Lists the alive rows of layer l's input; the encoded point's rows always are. */
+static void disti_list_alive(const dist_net *net, disti_block *b, int l)
+{
+    const disti_linear *layer = &net->layer[l];
+    uint64_t *mask = b->mask + (size_t)l * (size_t)net->max_rows;
+    int *alive = b->alive + (size_t)l * (size_t)net->max_rows;
+    int count = 0, relu = net->activation == DIST_ACTIVATION_RELU;
+    for (int u = 0; u < layer->prev; u++) {
+        alive[count] = u;
+        count += !relu || mask[u] != 0;
+    }
+    b->alive_units[l] = count;
+    for (int i = 0; i < layer->point; i++) {
+        mask[layer->prev + i] = ~(uint64_t)0;
+        alive[count++] = layer->prev + i;
+    }
+    b->alive_count[l] = count;
+}
+
+/* A linear layer by the user's BLAS: the previous units' columns, then the point's. */
+static void disti_linear_blas(const dist_shape *shape, int l, const float *x, float *y)
+{
+    const dist_net *net = shape->net;
+    const disti_linear *layer = &net->layer[l];
+    const dist_blas *blas = &shape->ctx->blas;
+    const float *w = net->params + layer->weight;
+    const float *bias = shape->bias + (size_t)l * (size_t)net->max_rows;
+    for (size_t o = 0; o < (size_t)layer->out; o++)
+        for (size_t c = 0; c < DISTI_BLOCK; c++) y[o * DISTI_BLOCK + c] = bias[o];
+    if (layer->prev > 0)
+        blas->sgemm_fn(blas->user, 0, 0, layer->out, DISTI_BLOCK, layer->prev, layer->scale, w + layer->x_column, layer->in, x,
+                       DISTI_BLOCK, 1.0f, y, DISTI_BLOCK);
+    if (layer->point > 0)
+        blas->sgemm_fn(blas->user, 0, 0, layer->out, DISTI_BLOCK, layer->point, layer->scale, w + layer->point_column, layer->in,
+                       x + (size_t)layer->prev * DISTI_BLOCK, DISTI_BLOCK, 1.0f, y, DISTI_BLOCK);
+}
+
+static int disti_use_blas(const dist_shape *shape, int l)
+{
+    const disti_linear *layer = &shape->net->layer[l];
+    int width = shape->ctx->blas_width;
+    return shape->ctx->blas.sgemm_fn != NULL && layer->out >= width && layer->prev >= width;
+}
+
+static void disti_transpose(size_t rows, size_t stride, float scale, const float *x, float *xt)
+{
+    for (size_t k = 0; k < rows; k++)
+        for (size_t c = 0; c < DISTI_BLOCK; c++) xt[c * stride + k] = scale * x[k * DISTI_BLOCK + c];
+}
+
+/* Hidden layer l: x to the input of layer l + 1 in y, with everything that its adjoint reads. */
+static void disti_hidden(const dist_shape *shape, const disti_kernels *kernels, disti_block *b, int l, const float *x, float *y)
+{
+    const dist_net *net = shape->net;
+    const disti_linear *layer = &net->layer[l];
+    size_t width = (size_t)net->max_rows, out = (size_t)layer->out;
+    uint64_t *mask = b->mask + (size_t)(l + 1) * width;
+    int plain = net->activation == DIST_ACTIVATION_RELU && !net->normed;
+    if (disti_use_blas(shape, l)) {
+        disti_linear_blas(shape, l, x, y);
+        if (plain) disti_activate(DIST_ACTIVATION_RELU, 1.0f, out * DISTI_BLOCK, y, NULL);
+        if (plain) disti_positive(out, y, mask);
+    } else {
+        disti_gemm g;
+        g.weights = net->panels + layer->panel;
+        g.bias = shape->bias + (size_t)l * width;
+        g.x = x;
+        g.y = y;
+        g.rows = layer->prev + layer->point;
+        g.alive = b->alive_count[l] < g.rows ? b->alive + (size_t)l * width : NULL;
+        g.alive_count = b->alive_count[l];
+        g.mask = plain ? mask : NULL;
+        g.out = layer->out;
+        g.columns = b->columns;
+        kernels->gemm(&g);
+    }
+    if (net->normed)
+        disti_norm(layer->out, net->norm_epsilon, net->params + layer->norm_weight, net->params + layer->norm_bias, y,
+                   b->hat + (size_t)l * width * DISTI_BLOCK, b->inverse + (size_t)l * DISTI_BLOCK);
+    if (!plain) {
+        float *slope = b->slope ? b->slope + (size_t)l * width * DISTI_BLOCK : NULL;
+        disti_activate(net->activation, l == 0 ? net->first_scale : net->scale, out * DISTI_BLOCK, y, slope);
+        if (net->activation == DIST_ACTIVATION_RELU) disti_positive(out, y, mask);
+    }
+    const disti_linear *next = &net->layer[l + 1];
+    if (next->point > 0) memcpy(y + out * DISTI_BLOCK, b->point, (size_t)next->point * DISTI_BLOCK * sizeof(float));
+    disti_list_alive(net, b, l + 1);
+}
+
+/* All hidden layers of the block whose encoded points stand in b->point. Returns the last layer's input.
+   store, unless NULL, gets every layer's input transposed. */
+static const float *disti_net_forward(const dist_shape *shape, disti_block *b, float *store, disti_counter *counter)
+{
+    const dist_net *net = shape->net;
+    disti_kernels kernels = disti_kernels_for(shape->ctx->isa);
+    const float *x = b->point;
+    double done = 0.0;
+    disti_list_alive(net, b, 0);
+    for (int l = 0; l < net->layers; l++) {
+        const disti_linear *layer = &net->layer[l];
+        size_t rows = (size_t)(layer->prev + layer->point);
+        if (store) disti_transpose(rows, disti_store_stride(layer), layer->scale, x, store + disti_store_offset(net, l, DISTI_STORE_INPUT));
+        done += (double)b->alive_count[l] * layer->out;
+        if (l + 1 == net->layers) break;
+        disti_hidden(shape, &kernels, b, l, x, b->act[l & 1]);
+        x = b->act[l & 1];
+    }
+    counter->done += done * b->columns;
+    return x;
+}
+
+/* Channel `channel` of the last layer, B lanes: value after the output function, and its slope. */
+static void disti_net_output(const dist_shape *shape, const disti_block *b, const float *x, int channel, float *value, float *slope)
+{
+    const dist_net *net = shape->net;
+    int l = net->layers - 1;
+    const disti_linear *layer = &net->layer[l];
+    int rows = layer->prev + layer->point;
+    disti_kernels kernels = disti_kernels_for(shape->ctx->isa);
+    const int *alive = b->alive_count[l] < rows ? b->alive + (size_t)l * (size_t)net->max_rows : NULL;
+    float bias = shape->bias[(size_t)l * (size_t)net->max_rows + (size_t)channel];
+    kernels.dot(net->panels + layer->panel + (size_t)channel * (size_t)rows, bias, x, alive, b->alive_count[l], rows, b->columns, value);
+    for (size_t c = 0; c < DISTI_BLOCK; c++) {
+        float v = value[c], d = 1.0f;
+        if (net->output == DISTI_OUTPUT_TANH || net->output == DISTI_OUTPUT_TANH_TWICE) {
+            d = disti_tanh_slope(v);
+            v = disti_tanh(v);
+        }
+        if (net->output == DISTI_OUTPUT_TANH_TWICE) {
+            d *= disti_tanh_slope(v);
+            v = disti_tanh(v);
+        }
+        if (net->output == DISTI_OUTPUT_SIGMOID) {
+            d = disti_sigmoid_slope(v);
+            v = disti_sigmoid(v);
+        }
+        value[c] = channel == net->sdf_channel ? v - net->level : v;
+        slope[c] = d;
+    }
+}
+
+/* delta of layer l's output (after the activation) to that of its pre-activation, in place. ReLU's mask is in it already.
+   sums, unless NULL, gets what gamma and beta receive: sum_c delta hat, sum_c delta. */
+static void disti_hidden_delta(const dist_net *net, const disti_block *b, int l, float *delta, float *sums)
+{
+    const disti_linear *layer = &net->layer[l];
+    size_t width = (size_t)net->max_rows, out = (size_t)layer->out;
+    if (net->activation == DIST_ACTIVATION_RELU && !net->normed) return;
+    if (b->slope) {
+        const float *slope = b->slope + (size_t)l * width * DISTI_BLOCK;
+        for (size_t i = 0; i < out * DISTI_BLOCK; i++) delta[i] *= slope[i];
+    }
+    if (net->normed) {
+        const uint64_t *mask = b->mask + (size_t)(l + 1) * width; /* rows that are not alive were not written */
+        if (net->activation == DIST_ACTIVATION_RELU)
+            for (size_t u = 0; u < out; u++)
+                if (!mask[u]) memset(delta + u * DISTI_BLOCK, 0, DISTI_BLOCK * sizeof(float));
+        const float *hat = b->hat + (size_t)l * width * DISTI_BLOCK;
+        for (size_t u = 0; sums && u < out; u++) {
+            sums[u] = sums[disti_store_out(layer) + u] = 0.0f;
+            for (size_t c = 0; c < (size_t)b->columns; c++) {
+                sums[u] += delta[u * DISTI_BLOCK + c] * hat[u * DISTI_BLOCK + c];
+                sums[disti_store_out(layer) + u] += delta[u * DISTI_BLOCK + c];
+            }
+        }
+        disti_norm_backward(layer->out, net->params + layer->norm_weight, b->hat + (size_t)l * width * DISTI_BLOCK,
+                            b->inverse + (size_t)l * DISTI_BLOCK, delta);
+    }
+}
+
+/* delta of layer l's pre-activation to its input rows d_x: W^T delta, masked. */
+static void disti_linear_backward(const dist_shape *shape, const disti_kernels *kernels, const disti_block *b, int l,
+                                  const float *delta, float *d_x)
+{
+    const dist_net *net = shape->net;
+    const disti_linear *layer = &net->layer[l];
+    size_t width = (size_t)net->max_rows;
+    int relu = net->activation == DIST_ACTIVATION_RELU;
+    const uint64_t *mask = relu ? b->mask + (size_t)l * width : NULL;
+    disti_gemm_back g;
+    g.rows = layer->prev + layer->point;
+    g.out = layer->out;
+    g.columns = b->columns;
+    if (disti_use_blas(shape, l)) {
+        const dist_blas *blas = &shape->ctx->blas;
+        const float *w = net->params + layer->weight;
+        if (relu && !net->normed) { /* rows that no kernel wrote are zero for a BLAS */
+            const uint64_t *mine = b->mask + (size_t)(l + 1) * width;
+            union {
+                const float *in;
+                float *out; /* the worker's own scratch */
+            } rows;
+            rows.in = delta;
+            for (size_t u = 0; u < (size_t)layer->out; u++)
+                if (!mine[u]) memset(rows.out + u * DISTI_BLOCK, 0, DISTI_BLOCK * sizeof(float));
+        }
+        blas->sgemm_fn(blas->user, 1, 0, layer->prev, DISTI_BLOCK, layer->out, layer->scale, w + layer->x_column, layer->in,
+                       delta, DISTI_BLOCK, 0.0f, d_x, DISTI_BLOCK);
+        if (layer->point > 0)
+            blas->sgemm_fn(blas->user, 1, 0, layer->point, DISTI_BLOCK, layer->out, layer->scale, w + layer->point_column,
+                           layer->in, delta, DISTI_BLOCK, 0.0f, d_x + (size_t)layer->prev * DISTI_BLOCK, DISTI_BLOCK);
+        for (size_t u = 0; mask && u < (size_t)g.rows; u++)
+            for (size_t c = 0; c < DISTI_BLOCK; c++)
+                if (!(mask[u] >> c & 1u)) d_x[u * DISTI_BLOCK + c] = 0.0f;
+        return;
+    }
+    g.weights = net->panels + layer->panel;
+    g.d_y = delta;
+    g.d_x = d_x;
+    g.mask = mask;
+    g.alive_rows = b->alive_count[l] < g.rows ? b->alive + (size_t)l * width : NULL;
+    g.alive_rows_count = b->alive_count[l];
+    int sparse = relu && !net->normed && b->alive_units[l + 1] < layer->out;
+    g.alive_out = sparse ? b->alive + (size_t)(l + 1) * width : NULL;
+    g.alive_out_count = b->alive_units[l + 1];
+    kernels->gemm_back(&g);
+}
+
+static void disti_add_point_rows(const disti_linear *layer, const float *d_x, float *d_point)
+{
+    const float *from = d_x + (size_t)layer->prev * DISTI_BLOCK;
+    for (size_t i = 0; i < (size_t)layer->point * DISTI_BLOCK; i++) d_point[i] += from[i];
+}
+
+/* Keeps layer l's delta, its dead rows as zeros: for the code (to) or for the weights (to a store). */
+static void disti_keep_delta(const dist_net *net, const disti_block *b, int l, const float *delta, float *to)
+{
+    const uint64_t *mask = b->mask + (size_t)(l + 1) * (size_t)net->max_rows;
+    int sparse = net->activation == DIST_ACTIVATION_RELU && !net->normed;
+    for (size_t u = 0; u < (size_t)net->layer[l].out; u++) {
+        if (sparse && !mask[u]) memset(to + u * DISTI_BLOCK, 0, DISTI_BLOCK * sizeof(float));
+        else memcpy(to + u * DISTI_BLOCK, delta + u * DISTI_BLOCK, DISTI_BLOCK * sizeof(float));
+    }
+}
+
+/* Reverse pass of one block from the seeds at the last layer's pre-activation: leaves the encoded point's gradient in
+   b->d_point and the deltas of the layers that see the code in b->fold_delta; store, unless NULL, gets all deltas. */
+static void disti_net_reverse(const dist_shape *shape, disti_block *b, const float *seed, float *store)
+{
+    const dist_net *net = shape->net;
+    disti_kernels kernels = disti_kernels_for(shape->ctx->isa);
+    int last = net->layers - 1, fold = net->fold_count;
+    size_t width = (size_t)net->max_rows;
+    const disti_linear *layer = &net->layer[last];
+    int rows = layer->prev + layer->point;
+    memset(b->d_point, 0, (size_t)net->point_size * DISTI_BLOCK * sizeof(float));
+    float *delta = b->delta[last & 1];
+    kernels.outer(net->panels + layer->panel + (size_t)net->sdf_channel * (size_t)rows, seed,
+                  b->alive_count[last] < rows ? b->alive + (size_t)last * width : NULL, b->alive_count[last], rows, b->columns,
+                  net->activation == DIST_ACTIVATION_RELU ? b->mask + (size_t)last * width : NULL, delta);
+    disti_add_point_rows(layer, delta, b->d_point);
+    if (store) memcpy(store + disti_store_offset(net, last, DISTI_STORE_DELTA), seed, DISTI_BLOCK * sizeof(float));
+    if (layer->code) {
+        fold--;
+        memcpy(b->fold_delta + (size_t)fold * width * DISTI_BLOCK, seed, DISTI_BLOCK * sizeof(float));
+    }
+    for (int l = last - 1; l >= 0; l--) {
+        layer = &net->layer[l];
+        disti_hidden_delta(net, b, l, delta, store ? store + disti_store_offset(net, l, DISTI_STORE_NORM) : NULL);
+        if (layer->code) disti_keep_delta(net, b, l, delta, b->fold_delta + (size_t)--fold * width * DISTI_BLOCK);
+        if (store) disti_keep_delta(net, b, l, delta, store + disti_store_offset(net, l, DISTI_STORE_DELTA));
+        float *d_x = b->delta[l & 1];
+        disti_linear_backward(shape, &kernels, b, l, delta, d_x);
+        disti_add_point_rows(layer, d_x, b->d_point);
+        delta = d_x;
+    }
+}
+
+/* Loads up to B points into the block and makes its worker's memory ready. */
+static void disti_block_begin(const dist_shape *shape, int worker, disti_block *b, size_t n, const float *points)
+{
+    disti_block_layout(shape->net, disti_scratch(shape->ctx, worker) + DISTI_FIELD_OFFSET, b);
+    b->columns = (int)n;
+    disti_encode(shape->net, n, points, b->point);
+    disti_counter_of(shape->ctx, worker)->dense += (double)dist_net_operations(shape->net, 1) * (double)n;
+}
+
+/* d_code += sum over the layers that see the code of scale W_code^T S,  S[o] = sum over points of delta[o]    (DESIGN: folding) */
+static void disti_fold_backward(const dist_net *net, const double *fold_sum, double *d_code)
+{
+    size_t fold = 0;
+    for (int l = 0; l < net->layers; l++) {
+        const disti_linear *layer = &net->layer[l];
+        if (!layer->code) continue;
+        const double *sum = fold_sum + fold++ * (size_t)net->max_rows;
+        size_t out = l + 1 == net->layers ? 1 : (size_t)layer->out;
+        size_t row = l + 1 == net->layers ? (size_t)net->sdf_channel : 0;
+        for (size_t o = 0; o < out; o++) {
+            const float *w = net->params + layer->weight + (o + row) * (size_t)layer->in + layer->code_column;
+            double s = sum[o] * (double)layer->scale;
+            if (s == 0.0) continue;
+            for (size_t j = 0; j < (size_t)net->code_size; j++) d_code[j] += s * (double)w[j];
+        }
+    }
+}
+
+/* S += sum_c seed[c] delta[o][c], over the block's own lanes. */
+static void disti_fold_sum(const dist_net *net, const disti_block *b, const float *seed)
+{
+    size_t fold = 0;
+    for (int l = 0; l < net->layers; l++) {
+        const disti_linear *layer = &net->layer[l];
+        if (!layer->code) continue;
+        size_t out = l + 1 == net->layers ? 1 : (size_t)layer->out;
+        const float *delta = b->fold_delta + fold * (size_t)net->max_rows * DISTI_BLOCK;
+        double *sum = b->fold_sum + fold++ * (size_t)net->max_rows;
+        for (size_t o = 0; o < out; o++) {
+            float part = 0.0f;
+            for (size_t c = 0; c < (size_t)b->columns; c++) part += seed[c] * delta[o * DISTI_BLOCK + c];
+            sum[o] += (double)part;
+        }
+    }
+}
+
+/* dist_field.fused_fn of a net. The reverse pass runs from f's own slope (seed 1), so that it leaves grad f; delta is linear
+   in the seed, so the seeds may come afterwards: d_code needs only sum_c seed[c] delta[.][c]. */
+static void disti_shape_fused(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient,
+                              void (*seed_fn)(void *seed_user, size_t first, size_t count, const float *sdf,
+                                              const float *gradient, float *d_sdf),
+                              void *seed_user, double *d_code)
+{
+    const dist_shape *shape = (const dist_shape *)user;
+    const dist_net *net = shape->net;
+    disti_block b;
+    disti_block_layout(net, disti_scratch(shape->ctx, worker) + DISTI_FIELD_OFFSET, &b);
+    if (d_code) memset(b.fold_sum, 0, (size_t)net->fold_count * (size_t)net->max_rows * sizeof(double));
+    for (size_t at = 0; at < n; at += DISTI_BLOCK) {
+        size_t count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK);
+        disti_block_begin(shape, worker, &b, count, points + 3 * at);
+        float *value = b.tail, *slope = b.tail + DISTI_BLOCK, *seed = b.tail + 2 * DISTI_BLOCK, *g = b.tail + 8 * DISTI_BLOCK;
+        const float *x = disti_net_forward(shape, &b, NULL, disti_counter_of(shape->ctx, worker));
+        disti_net_output(shape, &b, x, net->sdf_channel, value, slope);
+        if (sdf) memcpy(sdf + at, value, count * sizeof(float));
+        if (!gradient && !seed_fn) continue;
+        disti_net_reverse(shape, &b, slope, NULL);
+        disti_encode_backward(net, b.point, b.d_point, g);
+        if (gradient) memcpy(gradient + 3 * at, g, 3 * count * sizeof(float));
+        if (!seed_fn) continue;
+        seed_fn(seed_user, at, count, value, g, seed);
+        if (d_code) disti_fold_sum(net, &b, seed);
+    }
+    if (d_code) disti_fold_backward(net, b.fold_sum, d_code);
+}
+
+static void disti_shape_eval_fn(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    disti_shape_fused(user, worker, n, points, sdf, gradient, NULL, NULL, NULL);
+}
+
+/* All channels (n, channels), or `count` of them from `first`. */
+static void disti_shape_channels(const dist_shape *shape, int worker, size_t n, const float *points, int first, int count,
+                                 float *channels)
+{
+    for (size_t at = 0; at < n; at += DISTI_BLOCK) {
+        disti_block b;
+        size_t columns = DISTI_MIN(n - at, (size_t)DISTI_BLOCK);
+        disti_block_begin(shape, worker, &b, columns, points + 3 * at);
+        const float *x = disti_net_forward(shape, &b, NULL, disti_counter_of(shape->ctx, worker));
+        for (int k = 0; k < count; k++) {
+            disti_net_output(shape, &b, x, first + k, b.tail, b.tail + DISTI_BLOCK);
+            for (size_t c = 0; c < columns; c++) channels[(at + c) * (size_t)count + (size_t)k] = b.tail[c];
+        }
+    }
+}
+
+static void disti_shape_color_fn(void *user, int worker, size_t n, const float *points, float *color)
+{
+    const dist_shape *shape = (const dist_shape *)user;
+    disti_shape_channels(shape, worker, n, points, shape->net->color_channel, 3, color);
+}
+
+#ifndef DIST_NO_TRAIN
+/* Weight gradients go in two phases over a chunk of blocks, so that no partial sums are needed and the bits do not depend
+   on the threads: blocks in parallel leave inputs and deltas in the store; then rows of weights in parallel add
+       dW[o][k] += sum over points of delta[o] x[k],   db[o] += sum of delta[o],   dW[o][code] += db[o] code. */
+typedef struct disti_weights_job {
+    const dist_shape *shape;
+    size_t n;
+    const float *points;
+    float *d_sdf;
+    dist_seed_fn seed_fn;
+    void *seed_user;
+    float *d_points;
+    double *d_code; /* (blocks of the chunk, code_size) or NULL */
+    float *d_weights;
+    size_t first;
+    int blocks;
+} disti_weights_job;
+
+static void disti_weights_block(void *arg, int index, int worker)
+{
+    const disti_weights_job *job = (const disti_weights_job *)arg;
+    const dist_shape *shape = job->shape;
+    const dist_net *net = shape->net;
+    disti_block b;
+    size_t at = job->first + (size_t)index * DISTI_BLOCK;
+    size_t count = DISTI_MIN(job->n - at, (size_t)DISTI_BLOCK);
+    float *store = shape->store + (size_t)index * shape->store_block_size;
+    disti_block_begin(shape, worker, &b, count, job->points + 3 * at);
+    float *value = b.tail, *slope = b.tail + DISTI_BLOCK, *seed = b.tail + 2 * DISTI_BLOCK, *g = b.tail + 8 * DISTI_BLOCK;
+    const float *x = disti_net_forward(shape, &b, store, disti_counter_of(shape->ctx, worker));
+    disti_net_output(shape, &b, x, net->sdf_channel, value, slope);
+    if (job->seed_fn) job->seed_fn(job->seed_user, at, count, value, NULL, seed);
+    else memcpy(seed, job->d_sdf + at, count * sizeof(float));
+    if (job->seed_fn && job->d_sdf) memcpy(job->d_sdf + at, seed, count * sizeof(float));
+    for (size_t c = 0; c < DISTI_BLOCK; c++) seed[c] = c < count ? seed[c] * slope[c] : 0.0f;
+    disti_net_reverse(shape, &b, seed, store);
+    if (job->d_points) {
+        disti_encode_backward(net, b.point, b.d_point, g);
+        for (size_t i = 0; i < 3 * count; i++) job->d_points[3 * at + i] += g[i];
+    }
+    if (job->d_code) {
+        for (size_t c = 0; c < DISTI_BLOCK; c++) value[c] = 1.0f;
+        memset(b.fold_sum, 0, (size_t)net->fold_count * (size_t)net->max_rows * sizeof(double));
+        disti_fold_sum(net, &b, value);
+        disti_fold_backward(net, b.fold_sum, job->d_code + (size_t)index * (size_t)net->code_size);
+    }
+}
+
+enum { DISTI_WEIGHT_ROWS = 64 }; /* outputs of one task of the second phase */
+
+/* Adds one block's share to `count` rows of layer l from row `o`; the last layer's only row stands at sdf_channel. */
+static void disti_weights_rows(const disti_weights_job *job, int l, size_t o, size_t count, int index)
+{
+    const dist_shape *shape = job->shape;
+    const dist_net *net = shape->net;
+    const disti_linear *layer = &net->layer[l];
+    disti_kernels kernels = disti_kernels_for(shape->ctx->isa);
+    const float *store = shape->store + (size_t)index * shape->store_block_size;
+    const float *xt = store + disti_store_offset(net, l, DISTI_STORE_INPUT);
+    const float *delta = store + disti_store_offset(net, l, DISTI_STORE_DELTA) + o * DISTI_BLOCK;
+    size_t row = l + 1 == net->layers ? (size_t)net->sdf_channel : o;
+    size_t columns = DISTI_MIN(job->n - job->first - (size_t)index * DISTI_BLOCK, (size_t)DISTI_BLOCK);
+    float *w = job->d_weights + layer->weight + row * (size_t)layer->in;
+    disti_gemm_weights g;
+    g.d_y = delta;
+    g.xt = xt;
+    g.d_weights = w + layer->x_column;
+    g.stride = (size_t)layer->in;
+    g.xt_stride = disti_store_stride(layer);
+    g.out = (int)count;
+    g.rows = layer->prev;
+    g.columns = (int)columns;
+    if (layer->prev > 0) kernels.gemm_weights(&g);
+    for (size_t i = 0; i < count; i++) {
+        float sum = 0.0f;
+        for (size_t c = 0; c < columns; c++) sum += delta[i * DISTI_BLOCK + c];
+        job->d_weights[layer->bias + row + i] += sum;
+        float *to = w + i * (size_t)layer->in;
+        for (size_t k = 0; k < (size_t)layer->point; k++) {
+            float s = 0.0f;
+            for (size_t c = 0; c < columns; c++) s += delta[i * DISTI_BLOCK + c] * xt[c * g.xt_stride + (size_t)layer->prev + k];
+            to[(size_t)layer->point_column + k] += s;
+        }
+        for (size_t j = 0; j < (size_t)layer->code; j++)
+            to[(size_t)layer->code_column + j] += layer->scale * sum * shape->code[j];
+    }
+    if (!net->normed || l + 1 == net->layers) return;
+    const float *sums = store + disti_store_offset(net, l, DISTI_STORE_NORM);
+    for (size_t i = o; i < o + count; i++) {
+        job->d_weights[layer->norm_weight + i] += sums[i];
+        job->d_weights[layer->norm_bias + i] += sums[disti_store_out(layer) + i];
+    }
+}
+
+static void disti_weights_task(void *arg, int index, int worker)
+{
+    const disti_weights_job *job = (const disti_weights_job *)arg;
+    const dist_net *net = job->shape->net;
+    (void)worker;
+    int l = 0;
+    size_t o = (size_t)index * DISTI_WEIGHT_ROWS;
+    for (; l + 1 < net->layers; l++) { /* tasks count off the layers' rows, each layer's rounded up to whole tasks */
+        size_t rows = ((size_t)net->layer[l].out + DISTI_WEIGHT_ROWS - 1) / DISTI_WEIGHT_ROWS * DISTI_WEIGHT_ROWS;
+        if (o < rows) break;
+        o -= rows;
+    }
+    size_t out = l + 1 == net->layers ? 1 : (size_t)net->layer[l].out;
+    size_t count = DISTI_MIN((size_t)DISTI_WEIGHT_ROWS, out - o);
+    for (int i = 0; i < job->blocks; i++) disti_weights_rows(job, l, o, count, i);
+}
+
+/* dist_field.weights_fn of a net. ctx->partial holds at least store_blocks sums of code_size. */
+static dist_status disti_shape_weights_fn(void *user, dist_context *ctx, size_t n, const float *points, float *d_sdf,
+                                          dist_seed_fn seed_fn, void *seed_user, float *d_points, double *d_code,
+                                          float *d_weights)
+{
+    const dist_shape *shape = (const dist_shape *)user;
+    const dist_net *net = shape->net;
+    size_t size = (size_t)net->code_size;
+    disti_weights_job job;
+    memset(&job, 0, sizeof job);
+    job.shape = shape;
+    job.n = n;
+    job.points = points;
+    job.d_sdf = d_sdf;
+    job.seed_fn = seed_fn;
+    job.seed_user = seed_user;
+    job.d_points = d_points;
+    job.d_code = d_code ? ctx->partial : NULL;
+    job.d_weights = d_weights;
+    int tasks = 1;
+    for (int l = 0; l + 1 < net->layers; l++) tasks += (net->layer[l].out + DISTI_WEIGHT_ROWS - 1) / DISTI_WEIGHT_ROWS;
+    for (; job.first < n; job.first += (size_t)shape->store_blocks * DISTI_BLOCK) {
+        size_t left = (n - job.first + DISTI_BLOCK - 1) / DISTI_BLOCK;
+        job.blocks = left < (size_t)shape->store_blocks ? (int)left : shape->store_blocks;
+        if (d_code) memset(ctx->partial, 0, (size_t)job.blocks * size * sizeof(double));
+        disti_run(ctx, job.blocks, disti_weights_block, &job);
+        disti_run(ctx, tasks, disti_weights_task, &job);
+        for (size_t i = 0; d_code && i < (size_t)job.blocks; i++)
+            for (size_t j = 0; j < size; j++) d_code[j] += ctx->partial[i * size + j];
+    }
+    return DIST_OK;
+}
+#endif
+
+/* Sampled |grad f| in the bounding sphere: the 90th percentile of 768 points, at least 1: what matters is not the steepest
+   spot but how far f exceeds the distance, which is its mean slope on the way. The points are those of a fixed low-discrepancy
+   sequence (the plastic number's). */
+static float disti_shape_slope(dist_shape *shape, const dist_field *field)
+{
+    enum { SAMPLES = 768, BINS = 256 };
+    int bins[BINS];
+    float points[3 * DISTI_BLOCK], sdf[DISTI_BLOCK], gradient[3 * DISTI_BLOCK];
+    memset(bins, 0, sizeof bins);
+    double u[3] = {0.5, 0.5, 0.5};
+    for (int i = 0; i < SAMPLES; i += DISTI_BLOCK) {
+        for (int j = 0; j < DISTI_BLOCK;) {
+            static const double step[3] = {0.8191725133961645, 0.6710436067037893, 0.5497004779019703};
+            double length = 0.0;
+            for (int k = 0; k < 3; k++) {
+                u[k] += step[k];
+                if (u[k] >= 1.0) u[k] -= 1.0;
+                length += (2.0 * u[k] - 1.0) * (2.0 * u[k] - 1.0);
+            }
+            if (length > 1.0) continue;
+            for (int k = 0; k < 3; k++) points[3 * j + k] = field->radius * (float)(2.0 * u[k] - 1.0);
+            j++;
+        }
+        unsigned state = disti_float_state_enter();
+        field->eval_fn(shape, 0, DISTI_BLOCK, points, sdf, gradient);
+        disti_float_state_leave(state);
+        for (int j = 0; j < DISTI_BLOCK; j++) {
+            float slope = disti_length(gradient[3 * j], gradient[3 * j + 1], gradient[3 * j + 2]);
+            int bin = disti_finite(slope) && slope < 8.0f ? (int)(slope * 32.0f) : BINS - 1;
+            bins[bin < BINS ? bin : BINS - 1]++;
+        }
+    }
+    int above = 0, bin = BINS - 1;
+    while (bin > 0 && above + bins[bin] <= SAMPLES / 10) above += bins[bin--];
+    float slope = (float)(bin + 1) / 32.0f;
+    return slope > 1.0f ? slope : 1.0f;
+}
+
+DIST_API dist_field dist_shape_field(dist_shape *shape)
+{
+    dist_field field;
+    memset(&field, 0, sizeof field);
+    if (!shape) return field;
+    const dist_net *net = shape->net;
+    field.user = shape;
+    field.owner = shape->ctx;
+    if (net->sdf_channel >= 0) {
+        field.eval_fn = disti_shape_eval_fn;
+        field.fused_fn = disti_shape_fused;
+#ifndef DIST_NO_TRAIN
+        field.weights_fn = disti_shape_weights_fn;
+        field.weight_count = net->param_count;
+#endif
+    }
+    if (net->color_channel >= 0) field.color_fn = disti_shape_color_fn;
+    field.radius = net->bound;
+    field.lipschitz = shape->lipschitz;
+    field.clamp = net->clamp;
+    field.code_size = net->code_size;
+    return field;
+}
+
+/* bias'[o] = bias[o] + scale sum_j W_code[o][j] code[j], in double                                          (folding; exact but for rounding) */
+DIST_API dist_status dist_shape_set_code(dist_shape *shape, const float *code)
+{
+    if (!shape) return DIST_BAD_ARGUMENT;
+    const dist_net *net = shape->net;
+    size_t size = (size_t)net->code_size;
+    for (size_t j = 0; code && j < size; j++)
+        if (!disti_finite(code[j]))
+            return disti_fail(shape->ctx, DIST_NOT_FINITE, "dist_shape_set_code: code[%d] is %d, must be finite", NULL, (double)j,
+                              (double)code[j]);
+    if (code) memcpy(shape->code, code, size * sizeof(float));
+    else memset(shape->code, 0, size * sizeof(float));
+    for (int l = 0; l < net->layers; l++) {
+        const disti_linear *layer = &net->layer[l];
+        float *bias = shape->bias + (size_t)l * (size_t)net->max_rows;
+        memset(bias, 0, (size_t)net->max_rows * sizeof(float));
+        for (size_t o = 0; o < (size_t)layer->out; o++) {
+            const float *w = net->params + layer->weight + o * (size_t)layer->in + layer->code_column;
+            double sum = 0.0;
+            for (size_t j = 0; j < (size_t)layer->code; j++) sum += (double)w[j] * (double)shape->code[j];
+            bias[o] = (float)((double)net->params[layer->bias + o] + (double)layer->scale * sum);
+        }
+    }
+    return DIST_OK;
+}
+
+DIST_API void dist_shape_destroy(dist_shape *shape)
+{
+    if (!shape) return;
+    dist_context *ctx = shape->ctx;
+    const dist_net *net = shape->net;
+    disti_free(ctx, shape->store, (size_t)shape->store_blocks * shape->store_block_size * sizeof(float));
+    disti_free(ctx, shape->bias, (size_t)net->layers * (size_t)net->max_rows * sizeof(float));
+    disti_free(ctx, shape->code, (size_t)net->code_size * sizeof(float));
+    disti_free(ctx, shape, sizeof *shape);
+}
+
+DIST_API dist_shape *dist_shape_create(dist_context *ctx, const dist_net *net, const float *code)
+{
+    disti_block b;
+    if (disti_enter(ctx, "dist_shape_create") != DIST_OK) return NULL;
+    if (!net) {
+        disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_shape_create: net is NULL", NULL, 0, 0);
+        return NULL;
+    }
+    if (disti_scratch_reserve(ctx, DISTI_FIELD_OFFSET + disti_block_layout(net, NULL, &b)) != DIST_OK) return NULL;
+    if (disti_partial_reserve(ctx, (size_t)net->code_size + (size_t)net->code_size / DISTI_SLOTS + 1) != DIST_OK) return NULL;
+    dist_shape *shape = (dist_shape *)disti_alloc(ctx, sizeof(dist_shape));
+    if (!shape) return NULL;
+    memset(shape, 0, sizeof *shape);
+    shape->ctx = ctx;
+    shape->net = net;
+    shape->code = (float *)disti_alloc(ctx, (size_t)net->code_size * sizeof(float));
+    shape->bias = (float *)disti_alloc(ctx, (size_t)net->layers * (size_t)net->max_rows * sizeof(float));
+    if (!shape->code || !shape->bias) goto fail;
+#ifndef DIST_NO_TRAIN
+    if (net->sdf_channel >= 0) {
+        size_t block = disti_store_offset(net, net->layers, DISTI_STORE_INPUT);
+        size_t blocks = ((size_t)4 << 20) / (block * sizeof(float));
+        shape->store_block_size = block;
+        shape->store_blocks = (int)(blocks < 2 ? 2 : blocks > 32 ? 32 : blocks);
+        shape->store = (float *)disti_alloc(ctx, (size_t)shape->store_blocks * block * sizeof(float));
+        if (!shape->store) goto fail;
+        memset(shape->store, 0, (size_t)shape->store_blocks * block * sizeof(float));
+    }
+#endif
+    if (dist_shape_set_code(shape, code) != DIST_OK) goto fail;
+    shape->lipschitz = 1.0f;
+    if (net->sdf_channel >= 0) {
+        dist_field field = dist_shape_field(shape);
+        shape->lipschitz = disti_shape_slope(shape, &field);
+    }
+    return shape;
+fail:
+    dist_shape_destroy(shape);
+    return NULL;
+}
+
+typedef struct disti_channels_job {
+    const dist_shape *shape;
+    disti_pieces pieces;
+    const float *points;
+    float *channels;
+} disti_channels_job;
+
+static void disti_channels_task(void *arg, int index, int worker)
+{
+    const disti_channels_job *job = (const disti_channels_job *)arg;
+    size_t first = (size_t)index * job->pieces.size;
+    int channels = job->shape->net->channels;
+    disti_shape_channels(job->shape, worker, DISTI_MIN(job->pieces.size, job->pieces.n - first), job->points + 3 * first, 0,
+                         channels, job->channels + first * (size_t)channels);
+}
+
+DIST_API dist_status dist_shape_eval(dist_context *ctx, dist_shape *shape, size_t n, const float *points, float *channels)
+{
+    disti_channels_job job;
+    dist_status status = disti_enter(ctx, "dist_shape_eval");
+    if (status != DIST_OK) return status;
+    if (!shape || !points || !channels)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_shape_eval: shape, points or channels is NULL", NULL, 0, 0);
+    if (shape->ctx != ctx)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_shape_eval: shape belongs to another context", NULL, 0, 0);
+    if (n == 0) return DIST_OK;
+    job.shape = shape;
+    job.pieces = disti_cut(n, 8 * DISTI_BLOCK, 1u << 20);
+    job.points = points;
+    job.channels = channels;
+    disti_run(ctx, job.pieces.count, disti_channels_task, &job);
+    return DIST_OK;
+}
+
+DIST_API int dist_net_code_size(const dist_net *net) { return net ? net->code_size : 0; }
+DIST_API int dist_net_code_count(const dist_net *net) { return net ? net->code_count : 0; }
+DIST_API int dist_net_channels(const dist_net *net) { return net ? net->channels : 0; }
+DIST_API float dist_net_bound(const dist_net *net) { return net ? net->bound : 0.0f; }
+DIST_API size_t dist_net_weight_count(const dist_net *net) { return net ? net->param_count : 0; }
+DIST_API const float *dist_net_weights(const dist_net *net) { return net ? net->params : NULL; }
+
+DIST_API const float *dist_net_code(const dist_net *net, int index)
+{
+    return net && index >= 0 && index < net->code_count ? net->codes + (size_t)index * (size_t)net->code_size : NULL;
+}
+
+DIST_API size_t dist_net_operations(const dist_net *net, int folded)
+{
+    size_t sum = 0;
+    for (int l = 0; net && l < net->layers; l++) {
+        const disti_linear *layer = &net->layer[l];
+        sum += (size_t)layer->out * (size_t)(layer->prev + layer->point + (folded ? 0 : layer->code));
+    }
+    return sum;
+}
+
+static void disti_net_free(dist_net *net)
+{
+    dist_allocator allocator = net->allocator;
+    if (net->params) allocator.free_fn(allocator.user, net->params, net->param_count * sizeof(float));
+    if (net->panels) allocator.free_fn(allocator.user, net->panels, net->panel_count * sizeof(float));
+    if (net->codes)
+        allocator.free_fn(allocator.user, net->codes, (size_t)net->code_count * (size_t)net->code_size * sizeof(float));
+    allocator.free_fn(allocator.user, net, sizeof *net);
+}
+
+DIST_API void dist_net_destroy(dist_net *net)
+{
+    if (net) disti_net_free(net);
+}
+
+static dist_net *disti_net_new(dist_context *ctx)
+{
+    dist_net *net = (dist_net *)disti_alloc(ctx, sizeof(dist_net));
+    if (!net) return NULL;
+    memset(net, 0, sizeof *net);
+    net->allocator = ctx->allocator;
+    net->first_scale = net->scale = 1.0f;
+    net->sdf_channel = net->color_channel = -1;
+    net->bound = 1.0f;
+    return net;
+}
+
+/* From the in and out of every layer, the sizes of input and code and the skips: what each column is, where each tensor
+   stands in params and panels, and the memory for both. */
+static dist_status disti_net_arrange(dist_context *ctx, dist_net *net, const char *function, const int *skip, float skip_scale)
+{
+    int input = net->point_size + net->code_size;
+    for (int l = 0; l < net->layers; l++) {
+        disti_linear *layer = &net->layer[l];
+        int sees_input = l == 0 || skip[l];
+        layer->prev = l == 0 ? 0 : net->layer[l - 1].out;
+        layer->point = sees_input ? net->point_size : 0;
+        layer->code = sees_input ? net->code_size : 0;
+        layer->scale = l > 0 && skip[l] ? skip_scale : 1.0f;
+        if (layer->in != layer->prev + (sees_input ? input : 0))
+            return disti_fail(ctx, DIST_BAD_FILE, "%s: a layer is %d wide at its input, but what feeds it has %d", function,
+                              layer->in, layer->prev + (sees_input ? input : 0));
+        int at = layer->prev > 0 && !net->skip_input_first ? layer->prev : 0;
+        layer->x_column = at > 0 || !sees_input ? 0 : input;
+        layer->point_column = at + (net->point_first ? 0 : net->code_size);
+        layer->code_column = at + (net->point_first ? net->point_size : 0);
+        layer->weight = net->param_count;
+        layer->bias = layer->weight + (size_t)layer->out * (size_t)layer->in;
+        layer->norm_weight = layer->bias + (size_t)layer->out;
+        layer->norm_bias = layer->norm_weight + (size_t)layer->out;
+        int normed = net->normed && l + 1 < net->layers;
+        net->param_count = normed ? layer->norm_bias + (size_t)layer->out : layer->norm_weight;
+        size_t rows = (size_t)(layer->prev + layer->point), out8 = ((size_t)layer->out + 7) & ~(size_t)7;
+        layer->panel = net->panel_count;
+        net->panel_count += (l + 1 < net->layers ? out8 * rows : (size_t)layer->out * rows) + 15;
+        net->panel_count &= ~(size_t)15;
+        net->max_rows = DISTI_MAX(net->max_rows, (int)((DISTI_MAX(rows, (size_t)layer->out) + 7) & ~(size_t)7));
+        net->fold_count += layer->code > 0;
+    }
+    net->params = (float *)disti_alloc(ctx, net->param_count * sizeof(float));
+    net->panels = (float *)disti_alloc(ctx, net->panel_count * sizeof(float));
+    if (net->code_count > 0) {
+        size_t count;
+        if (!disti_size_mul((size_t)net->code_count, (size_t)net->code_size * sizeof(float), &count)) count = (size_t)-1;
+        net->codes = (float *)disti_alloc(ctx, count);
+    }
+    return net->params && net->panels && (net->code_count == 0 || net->codes) ? DIST_OK : DIST_OUT_OF_MEMORY;
+}
+
+/* params to panels: kernels' order, without the code's columns, skip_scale multiplied in. */
+static void disti_net_pack(dist_net *net)
+{
+    memset(net->panels, 0, net->panel_count * sizeof(float));
+    for (int l = 0; l < net->layers; l++) {
+        const disti_linear *layer = &net->layer[l];
+        size_t rows = (size_t)(layer->prev + layer->point);
+        int last = l + 1 == net->layers;
+        for (size_t o = 0; o < (size_t)layer->out; o++) {
+            const float *w = net->params + layer->weight + o * (size_t)layer->in;
+            for (size_t k = 0; k < rows; k++) {
+                size_t column = k < (size_t)layer->prev ? (size_t)layer->x_column + k
+                                                        : (size_t)layer->point_column + k - (size_t)layer->prev;
+                size_t at = last ? o * rows + k : (o / 8 * rows + k) * 8 + o % 8;
+                net->panels[layer->panel + at] = layer->scale * w[column];
+            }
+        }
+    }
+}
+
+/* What dist_net_load carries along. */
+typedef struct disti_loader {
+    dist_context *ctx;
+    disti_archive archive;
+    const char *function;
+    const char *prefix;
+    dist_net *net;
+    int skip[DISTI_MAX_LAYERS];
+    float skip_scale;
+} disti_loader;
+
+/* "prefix" "stem" K "ending", K below 100 */
+static const disti_tensor *disti_loader_find(const disti_loader *loader, const char *stem, int k, const char *ending)
+{
+    char name[96];
+    size_t n = 0;
+    const char *parts[3];
+    parts[0] = loader->prefix;
+    parts[1] = stem;
+    parts[2] = ending;
+    for (int i = 0; i < 3; i++) {
+        if (i == 2 && k >= 10) name[n++] = (char)('0' + k / 10);
+        if (i == 2) name[n++] = (char)('0' + k % 10);
+        for (const char *c = parts[i]; *c; c++) name[n++] = *c;
+    }
+    name[n] = 0;
+    return disti_archive_find(&loader->archive, name);
+}
+
+static dist_status disti_loader_bad(const disti_loader *loader, const char *key)
+{
+    (void)loader->function;
+    const char *value = disti_archive_meta(&loader->archive, key);
+    char text[160];
+    size_t n = 0;
+    for (const char *c = key; *c && n < 60; c++) text[n++] = *c;
+    memcpy(text + n, " is \"", 5);
+    n += 5;
+    for (const char *c = value ? value : ""; *c && n < 140; c++) text[n++] = *c;
+    text[n++] = '"';
+    text[n] = 0;
+    return disti_fail(loader->ctx, DIST_BAD_FILE, "dist_net_load: metadata %s, which is not one of the values it can have", text, 0, 0);
+}
+
+/* A number at **s, or failure; advances. */
+static int disti_scan_number(const char **s, double *out)
+{
+    return disti_parse_double(s, *s + strlen(*s), out) && disti_finite_double(*out);
+}
+
+/* A metadata number within [low, high]; absent: *out keeps its default. */
+static dist_status disti_loader_number(const disti_loader *loader, const char *key, double low, double high, double *out)
+{
+    const char *s = disti_archive_meta(&loader->archive, key);
+    double value;
+    if (!s) return DIST_OK;
+    if (!disti_scan_number(&s, &value) || *s || value < low || value > high) return disti_loader_bad(loader, key);
+    *out = value;
+    return DIST_OK;
+}
+
+/* Index of a metadata value in a |-separated list; absent: 0; none of them: -1. */
+static int disti_loader_choice(const disti_loader *loader, const char *key, const char *choices)
+{
+    const char *value = disti_archive_meta(&loader->archive, key);
+    if (!value) return 0;
+    size_t n = strlen(value);
+    for (int index = 0;; index++) {
+        const char *end = strchr(choices, '|');
+        size_t length = end ? (size_t)(end - choices) : strlen(choices);
+        if (length == n && memcmp(choices, value, n) == 0) return index;
+        if (!end) return -1;
+        choices = end + 1;
+    }
+}
+
+static dist_status disti_loader_activation(disti_loader *loader)
+{
+    static const char *const names[6] = {"relu", "elu", "softplus", "sine", "tanh", "none"};
+    dist_net *net = loader->net;
+    const char *s = disti_archive_meta(&loader->archive, "dist.activation");
+    double first = 1.0, other;
+    int index = 0;
+    if (!s) return DIST_OK;
+    size_t n = strcspn(s, ":");
+    while (index < 6 && !(strlen(names[index]) == n && memcmp(names[index], s, n) == 0)) index++;
+    if (index == 6) return disti_loader_bad(loader, "dist.activation");
+    net->activation = index;
+    int scaled = index == DIST_ACTIVATION_SOFTPLUS || index == DIST_ACTIVATION_SINE;
+    s += n;
+    if (!scaled) return *s ? disti_loader_bad(loader, "dist.activation") : DIST_OK;
+    first = index == DIST_ACTIVATION_SINE ? 30.0 : 1.0; /* SIREN's omega, PyTorch's beta */
+    if (*s == ':' && (s++, !disti_scan_number(&s, &first))) return disti_loader_bad(loader, "dist.activation");
+    other = first;
+    if (index == DIST_ACTIVATION_SINE && *s == ',' && (s++, !disti_scan_number(&s, &other)))
+        return disti_loader_bad(loader, "dist.activation");
+    if (*s || !(first >= 1e-6 && first <= 1e6 && other >= 1e-6 && other <= 1e6))
+        return disti_loader_bad(loader, "dist.activation");
+    net->first_scale = (float)first;
+    net->scale = (float)other;
+    return DIST_OK;
+}
+
+static dist_status disti_loader_channels(disti_loader *loader)
+{
+    dist_net *net = loader->net;
+    const char *s = disti_archive_meta(&loader->archive, "dist.channels");
+    if (!s) s = "sdf";
+    while (net->channels < DISTI_MAX_CHANNELS) {
+        size_t n = strcspn(s, ",");
+        if (n == 0 || n >= sizeof net->channel_names[0]) break;
+        memcpy(net->channel_names[net->channels], s, n);
+        if (n == 3 && memcmp(s, "sdf", 3) == 0 && net->sdf_channel < 0) net->sdf_channel = net->channels;
+        if (n == 1 && s[0] == 'r' && memcmp(s, "r,g,b", 5) == 0 && (s[5] == 0 || s[5] == ','))
+            net->color_channel = net->channels;
+        net->channels++;
+        s += n;
+        if (!*s) return DIST_OK;
+        s++;
+    }
+    return disti_loader_bad(loader, "dist.channels");
+}
+
+/* Everything the metadata says, but for what needs the tensors' shapes. */
+static dist_status disti_loader_meta(disti_loader *loader)
+{
+    dist_net *net = loader->net;
+    double levels = 0, base = 3.14159265358979323846, epsilon = 1e-5, level = 0, bound = 1, raw = 1, scale = 1;
+    dist_status status = disti_loader_activation(loader);
+    if (status == DIST_OK) status = disti_loader_channels(loader);
+    if (status != DIST_OK) return status;
+    static const int outputs[4] = {DISTI_OUTPUT_TANH, DISTI_OUTPUT_NONE, DISTI_OUTPUT_SIGMOID, DISTI_OUTPUT_TANH_TWICE};
+    int output = disti_loader_choice(loader, "dist.output", "tanh|none|sigmoid|tanh:2");
+    int input = disti_loader_choice(loader, "dist.input", "code,xyz|xyz,code");
+    int order = disti_loader_choice(loader, "dist.skip_order", "x,input|input,x");
+    int encoding = disti_loader_choice(loader, "dist.encoding", "none|fourier");
+    int sines = disti_loader_choice(loader, "dist.encoding.order", "sin,cos|cos_all,sin_all|sin_all,cos_all");
+    int norm = disti_loader_choice(loader, "dist.norm", "none|layer");
+    if (output < 0) return disti_loader_bad(loader, "dist.output");
+    if (input < 0) return disti_loader_bad(loader, "dist.input");
+    if (order < 0) return disti_loader_bad(loader, "dist.skip_order");
+    if (encoding < 0) return disti_loader_bad(loader, "dist.encoding");
+    if (sines < 0) return disti_loader_bad(loader, "dist.encoding.order");
+    if (norm < 0) return disti_loader_bad(loader, "dist.norm");
+    if ((status = disti_loader_number(loader, "dist.encoding.levels", 0, DISTI_MAX_LEVELS, &levels)) != DIST_OK) return status;
+    if ((status = disti_loader_number(loader, "dist.encoding.base", 1e-6, 1e6, &base)) != DIST_OK) return status;
+    if ((status = disti_loader_number(loader, "dist.encoding.raw", 0, 1, &raw)) != DIST_OK) return status;
+    if ((status = disti_loader_number(loader, "dist.skip_scale", 1e-6, 1e6, &scale)) != DIST_OK) return status;
+    if ((status = disti_loader_number(loader, "dist.norm.epsilon", 0, 1, &epsilon)) != DIST_OK) return status;
+    if ((status = disti_loader_number(loader, "dist.level", -1e6, 1e6, &level)) != DIST_OK) return status;
+    if ((status = disti_loader_number(loader, "dist.bound", 1e-6, 1e6, &bound)) != DIST_OK) return status;
+    if (levels != (int)levels) return disti_loader_bad(loader, "dist.encoding.levels");
+    if (raw != (int)raw) return disti_loader_bad(loader, "dist.encoding.raw");
+    net->output = outputs[output];
+    net->point_first = input;
+    net->skip_input_first = order;
+    net->levels = encoding ? (int)levels : 0;
+    net->raw = encoding ? (int)raw : 1;
+    net->order = sines;
+    net->base = base;
+    net->normed = norm;
+    net->norm_epsilon = (float)epsilon;
+    net->level = (float)level;
+    net->bound = (float)bound;
+    net->point_size = (net->raw ? 3 : 0) + 6 * net->levels;
+    loader->skip_scale = (float)scale;
+    return net->point_size > 0 ? DIST_OK : disti_loader_bad(loader, "dist.encoding.levels");
+}
+
+/* The weight tensor of layer k: plain, or v of a weight-norm pair in either spelling with *gain its g. */
+static const disti_tensor *disti_loader_weight(const disti_loader *loader, int k, const disti_tensor **gain)
+{
+    const disti_tensor *w = disti_loader_find(loader, "lin", k, ".weight");
+    *gain = NULL;
+    if (w) return w;
+    *gain = disti_loader_find(loader, "lin", k, ".weight_g");
+    if (*gain) return disti_loader_find(loader, "lin", k, ".weight_v");
+    *gain = disti_loader_find(loader, "lin", k, ".parametrizations.weight.original0");
+    return *gain ? disti_loader_find(loader, "lin", k, ".parametrizations.weight.original1") : NULL;
+}
+
+/* layers, their in and out, the skips and the code's size, from the tensors' shapes and the metadata. */
+static dist_status disti_loader_shapes(disti_loader *loader)
+{
+    dist_net *net = loader->net;
+    const char *list = disti_archive_meta(&loader->archive, "dist.skip");
+    const disti_tensor *gain;
+    double size, clamp, at;
+    loader->prefix = "";
+    if (!disti_loader_weight(loader, 0, &gain)) loader->prefix = "module.";
+    for (int k = 0; k < DISTI_MAX_LAYERS; k++) {
+        const disti_tensor *w = disti_loader_weight(loader, k, &gain);
+        if (!w) break;
+        if (w->rank != 2 || w->shape[0] < 1 || w->shape[1] < 1 || w->shape[0] > DISTI_MAX_WIDTH || w->shape[1] > 2 * DISTI_MAX_WIDTH)
+            return disti_fail(loader->ctx, DIST_BAD_FILE, "dist_net_load: tensor %s must be (out, in) of at most %d by %d", w->name,
+                              DISTI_MAX_WIDTH, 2 * DISTI_MAX_WIDTH);
+        net->layer[k].out = (int)w->shape[0];
+        net->layer[k].in = (int)w->shape[1];
+        net->layers++;
+    }
+    if (net->layers == 0)
+        return disti_fail(loader->ctx, DIST_BAD_FILE,
+                          "dist_net_load: no tensor is called lin0.weight, lin0.weight_v or the like (also with module. before it)",
+                          NULL, 0, 0);
+    if (net->layers == DISTI_MAX_LAYERS && disti_loader_weight(loader, DISTI_MAX_LAYERS, &gain))
+        return disti_fail(loader->ctx, DIST_UNSUPPORTED, "dist_net_load: more than %d layers", NULL, DISTI_MAX_LAYERS, 0);
+    size = net->layer[0].in - net->point_size;
+    if (disti_loader_number(loader, "dist.code_size", 0, DISTI_MAX_WIDTH, &size) != DIST_OK) return DIST_BAD_FILE;
+    if (size != (int)size || size + net->point_size != net->layer[0].in)
+        return disti_fail(loader->ctx, DIST_BAD_FILE, "dist_net_load: layer 0 takes %d numbers, but code and point have %d",
+                          NULL, net->layer[0].in, size + net->point_size);
+    net->code_size = (int)size;
+    for (int l = 1; l < net->layers && !list; l++)
+        loader->skip[l] = net->layer[l].in == net->layer[l - 1].out + net->layer[0].in;
+    while (list && *list) {
+        if (!disti_scan_number(&list, &at) || at != (int)at || at < 1 || at >= net->layers || (*list && *list != ','))
+            return disti_loader_bad(loader, "dist.skip");
+        loader->skip[(int)at] = 1;
+        if (*list == ',') list++;
+    }
+    if (net->layer[net->layers - 1].out != net->channels)
+        return disti_fail(loader->ctx, DIST_BAD_FILE, "dist_net_load: the last layer gives %d numbers, but dist.channels names %d",
+                          NULL, net->layer[net->layers - 1].out, net->channels);
+    clamp = net->code_size > 0 ? (double)0.1f : 0.0;
+    if (disti_loader_number(loader, "dist.clamp", 0, 1e6, &clamp) != DIST_OK) return DIST_BAD_FILE;
+    net->clamp = (float)clamp;
+    return DIST_OK;
+}
+
+/* Tensor -> count floats, all finite. */
+static dist_status disti_loader_read(const disti_loader *loader, const disti_tensor *tensor, const char *what, int k, size_t count, float *out)
+{
+    if (!tensor)
+        return disti_fail(loader->ctx, DIST_BAD_FILE, "dist_net_load: tensor %s of layer %d is missing", what, k, 0);
+    if (tensor->dtype == DISTI_DTYPE_OTHER)
+        return disti_fail(loader->ctx, DIST_UNSUPPORTED, "dist_net_load: tensor %s must be F32, F16 or BF16", tensor->name, 0, 0);
+    if (tensor->count != count)
+        return disti_fail(loader->ctx, DIST_BAD_FILE, "dist_net_load: tensor %s has %d numbers, must have %d", tensor->name,
+                          (double)tensor->count, (double)count);
+    disti_tensor_read(tensor, out);
+    for (size_t i = 0; i < count; i++)
+        if (!disti_finite(out[i]))
+            return disti_fail(loader->ctx, DIST_NOT_FINITE, "dist_net_load: tensor %s holds %d at place %d, must be finite",
+                              tensor->name, (double)out[i], (double)i);
+    return DIST_OK;
+}
+
+/* Weight norm: w[o] = g[o] v[o] / |v[o]|, in double; a zero row stays zero. gain is read into the bias's place first. */
+static void disti_weight_norm(size_t out, size_t in, const float *gain, float *v)
+{
+    for (size_t o = 0; o < out; o++) {
+        double sum = 0.0;
+        for (size_t k = 0; k < in; k++) sum += (double)v[o * in + k] * (double)v[o * in + k];
+        double factor = sum > 0.0 ? (double)gain[o] / sqrt(sum) : 0.0;
+        for (size_t k = 0; k < in; k++) v[o * in + k] = (float)((double)v[o * in + k] * factor);
+    }
+}
+
+static dist_status disti_loader_values(disti_loader *loader)
+{
+    dist_net *net = loader->net;
+    dist_status status;
+    for (int l = 0; l < net->layers; l++) {
+        const disti_linear *layer = &net->layer[l];
+        const disti_tensor *gain, *weight = disti_loader_weight(loader, l, &gain);
+        size_t out = (size_t)layer->out, in = (size_t)layer->in;
+        float *w = net->params + layer->weight, *bias = net->params + layer->bias;
+        if ((status = disti_loader_read(loader, weight, "weight", l, out * in, w)) != DIST_OK) return status;
+        if (gain) {
+            if ((status = disti_loader_read(loader, gain, "weight_g", l, out, bias)) != DIST_OK) return status;
+            disti_weight_norm(out, in, bias, w);
+        }
+        if ((status = disti_loader_read(loader, disti_loader_find(loader, "lin", l, ".bias"), "bias", l, out, bias)) != DIST_OK)
+            return status;
+        if (!net->normed || l + 1 == net->layers) continue;
+        if ((status = disti_loader_read(loader, disti_loader_find(loader, "norm", l, ".weight"), "norm weight", l, out,
+                                        net->params + layer->norm_weight)) != DIST_OK) return status;
+        if ((status = disti_loader_read(loader, disti_loader_find(loader, "norm", l, ".bias"), "norm bias", l, out,
+                                        net->params + layer->norm_bias)) != DIST_OK) return status;
+    }
+    if (net->code_count == 0) return DIST_OK;
+    return disti_loader_read(loader, disti_archive_find(&loader->archive, "codes"), "codes", 0,
+                             (size_t)net->code_count * (size_t)net->code_size, net->codes);
+}
+
+static dist_status disti_loader_codes(disti_loader *loader)
+{
+    const disti_tensor *codes = disti_archive_find(&loader->archive, "codes");
+    if (!codes || loader->net->code_size == 0) return DIST_OK;
+    if (codes->rank != 2 || codes->shape[1] != (size_t)loader->net->code_size || codes->shape[0] > 0x7fffffffu)
+        return disti_fail(loader->ctx, DIST_BAD_FILE, "dist_net_load: tensor codes must be (n, %d)", NULL, loader->net->code_size, 0);
+    loader->net->code_count = (int)codes->shape[0];
+    return DIST_OK;
+}
+
+DIST_API dist_net *dist_net_load(dist_context *ctx, const void *bytes, size_t size)
+{
+    disti_loader loader;
+    if (disti_enter(ctx, "dist_net_load") != DIST_OK) return NULL;
+    if (!bytes) {
+        disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_net_load: bytes is NULL", NULL, 0, 0);
+        return NULL;
+    }
+    memset(&loader, 0, sizeof loader);
+    loader.ctx = ctx;
+    loader.function = "dist_net_load";
+    dist_status status = disti_archive_open(ctx, loader.function, bytes, size, &loader.archive);
+    if (status == DIST_OK) {
+        loader.net = disti_net_new(ctx);
+        status = loader.net ? DIST_OK : DIST_OUT_OF_MEMORY;
+    }
+    if (status == DIST_OK) status = disti_loader_meta(&loader);
+    if (status == DIST_OK) status = disti_loader_shapes(&loader);
+    if (status == DIST_OK) status = disti_loader_codes(&loader);
+    if (status == DIST_OK) status = disti_net_arrange(ctx, loader.net, loader.function, loader.skip, loader.skip_scale);
+    if (status == DIST_OK) status = disti_loader_values(&loader);
+    if (status == DIST_OK) disti_net_pack(loader.net);
+    disti_archive_close(ctx, &loader.archive);
+    if (status == DIST_OK) return loader.net;
+    dist_net_destroy(loader.net);
+    return NULL;
+}
+
+/* Text of the metadata being written, one value after another. */
+typedef struct disti_saver {
+    const char *keys[24], *values[24];
+    size_t count, at;
+    char text[1024];
+} disti_saver;
+
+static void disti_saver_text(disti_saver *s, const char *key, const char *value)
+{
+    s->keys[s->count] = key;
+    s->values[s->count++] = value;
+}
+
+/* key: before a, and b with a comma unless it is the same number */
+static void disti_saver_number(disti_saver *s, const char *key, const char *before, double a, double b, int digits)
+{
+    size_t n = strlen(before);
+    char *to = s->text + s->at;
+    memcpy(to, before, n);
+    n += disti_format_number(to + n, a, digits);
+    if (a != b) {
+        to[n++] = ',';
+        n += disti_format_number(to + n, b, digits);
+    }
+    to[n++] = 0;
+    s->at += n;
+    disti_saver_text(s, key, to);
+}
+
+static void disti_saver_meta(disti_saver *s, const dist_net *net)
+{
+    static const char *const activations[6] = {"relu", "elu", "softplus:", "sine:", "tanh", "none"};
+    static const char *const outputs[4] = {"none", "tanh", "sigmoid", "tanh:2"};
+    static const char *const orders[3] = {"sin,cos", "cos_all,sin_all", "sin_all,cos_all"};
+    float skip_scale = 1.0f;
+    char *skip = s->text, *channels;
+    memset(s, 0, sizeof *s);
+    for (int l = 1; l < net->layers; l++) {
+        if (!net->layer[l].point) continue;
+        if (s->at) skip[s->at++] = ',';
+        s->at += disti_format_number(skip + s->at, l, 6);
+        skip_scale = net->layer[l].scale;
+    }
+    channels = s->text + ++s->at;
+    for (int c = 0; c < net->channels; c++) {
+        size_t n = strlen(net->channel_names[c]);
+        if (c) s->text[s->at++] = ',';
+        memcpy(s->text + s->at, net->channel_names[c], n);
+        s->at += n;
+    }
+    s->at++;
+    disti_saver_text(s, "format", "dist-net-1");
+    if (net->activation == DIST_ACTIVATION_SOFTPLUS || net->activation == DIST_ACTIVATION_SINE)
+        disti_saver_number(s, "dist.activation", activations[net->activation], (double)net->first_scale, (double)net->scale, 9);
+    else
+        disti_saver_text(s, "dist.activation", activations[net->activation]);
+    disti_saver_text(s, "dist.output", outputs[net->output]);
+    disti_saver_text(s, "dist.input", net->point_first ? "xyz,code" : "code,xyz");
+    disti_saver_text(s, "dist.skip", skip);
+    disti_saver_text(s, "dist.skip_order", net->skip_input_first ? "input,x" : "x,input");
+    disti_saver_number(s, "dist.skip_scale", "", (double)skip_scale, (double)skip_scale, 9);
+    disti_saver_text(s, "dist.encoding", net->levels ? "fourier" : "none");
+    if (net->levels) {
+        disti_saver_number(s, "dist.encoding.levels", "", net->levels, net->levels, 6);
+        disti_saver_number(s, "dist.encoding.base", "", net->base, net->base, 15);
+        disti_saver_text(s, "dist.encoding.raw", net->raw ? "1" : "0");
+        disti_saver_text(s, "dist.encoding.order", orders[net->order]);
+    }
+    disti_saver_text(s, "dist.norm", net->normed ? "layer" : "none");
+    if (net->normed) disti_saver_number(s, "dist.norm.epsilon", "", (double)net->norm_epsilon, (double)net->norm_epsilon, 9);
+    disti_saver_number(s, "dist.level", "", (double)net->level, (double)net->level, 9);
+    disti_saver_number(s, "dist.code_size", "", net->code_size, net->code_size, 6);
+    disti_saver_text(s, "dist.channels", channels);
+    disti_saver_number(s, "dist.bound", "", (double)net->bound, (double)net->bound, 9);
+    disti_saver_number(s, "dist.clamp", "", (double)net->clamp, (double)net->clamp, 9);
+}
+
+DIST_API dist_status dist_net_save(dist_context *ctx, const dist_net *net, void *buffer, size_t capacity, size_t *size)
+{
+    enum { MOST = 4 * DISTI_MAX_LAYERS + 1 };
+    static const char *const endings[4] = {".weight", ".bias", ".weight", ".bias"};
+    disti_tensor_out tensors[MOST];
+    char names[MOST][16];
+    disti_saver saver;
+    size_t count = 0;
+    dist_status status = disti_enter(ctx, "dist_net_save");
+    if (status != DIST_OK) return status;
+    if (!net || !size) return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_net_save: %s is NULL", net ? "size" : "net", 0, 0);
+    memset(tensors, 0, sizeof tensors);
+    for (int l = 0; l < net->layers; l++) {
+        const disti_linear *layer = &net->layer[l];
+        size_t offsets[4] = {layer->weight, layer->bias, layer->norm_weight, layer->norm_bias};
+        for (int i = 0; i < (net->normed && l + 1 < net->layers ? 4 : 2); i++) {
+            char *name = names[count];
+            size_t n = i < 2 ? 3 : 4;
+            memcpy(name, i < 2 ? "lin" : "norm", n);
+            n += disti_format_number(name + n, l, 6);
+            memcpy(name + n, endings[i], strlen(endings[i]) + 1);
+            tensors[count].name = name;
+            tensors[count].rank = i == 0 ? 2 : 1;
+            tensors[count].shape[0] = (size_t)layer->out;
+            tensors[count].shape[1] = (size_t)layer->in;
+            tensors[count++].data = net->params + offsets[i];
+        }
+    }
+    if (net->code_count > 0) {
+        tensors[count].name = "codes";
+        tensors[count].rank = 2;
+        tensors[count].shape[0] = (size_t)net->code_count;
+        tensors[count].shape[1] = (size_t)net->code_size;
+        tensors[count++].data = net->codes;
+    }
+    disti_saver_meta(&saver, net);
+    return disti_archive_write(ctx, "dist_net_save", count, tensors, saver.count, saver.keys, saver.values, buffer, capacity, size);
+}
+
+#ifndef DIST_NO_STDIO
+/* Reads a whole file into memory of the context; *size bytes, to be given back with disti_free. */
+static unsigned char *disti_file_read(dist_context *ctx, const char *function, const char *path, size_t *size)
+{
+    char text[200];
+    size_t n = 0, got = 0;
+    for (const char *c = function; *c && n < 40; c++) text[n++] = *c;
+    memcpy(text + n, ": ", 2);
+    n += 2;
+    for (const char *c = path ? path : "(null)"; *c && n + 1 < sizeof text; c++) text[n++] = *c;
+    text[n] = 0;
+    FILE *file = path ? fopen(path, "rb") : NULL;
+    *size = 0;
+    if (!file) {
+        disti_fail(ctx, DIST_IO, "%s: cannot be opened", text, 0, 0);
+        return NULL;
+    }
+    long end = fseek(file, 0, SEEK_END) == 0 ? ftell(file) : -1;
+    if (end < 0 || end > 0x7ffffff0L || fseek(file, 0, SEEK_SET) != 0) {
+        fclose(file);
+        disti_fail(ctx, DIST_IO, "%s: is not a file that can be read whole", text, 0, 0);
+        return NULL;
+    }
+    unsigned char *bytes = (unsigned char *)disti_alloc(ctx, (size_t)end);
+    if (bytes) got = fread(bytes, 1, (size_t)end, file);
+    fclose(file);
+    if (bytes && got != (size_t)end) {
+        disti_free(ctx, bytes, (size_t)end);
+        disti_fail(ctx, DIST_IO, "%s: reading failed after %d of %d bytes", text, (double)got, (double)end);
+        return NULL;
+    }
+    *size = (size_t)end;
+    return bytes;
+}
+
+static dist_status disti_file_write(dist_context *ctx, const char *function, const char *path, const void *bytes, size_t size)
+{
+    (void)function;
+    FILE *file = path ? fopen(path, "wb") : NULL;
+    if (!file) return disti_fail(ctx, DIST_IO, "%s: cannot be opened for writing", path, 0, 0);
+    size_t put = fwrite(bytes, 1, size, file);
+    int closed = fclose(file);
+    if (put != size || closed != 0)
+        return disti_fail(ctx, DIST_IO, "%s: writing failed after %d of %d bytes", path, (double)put, (double)size);
+    return DIST_OK;
+}
+
+DIST_API dist_net *dist_net_load_file(dist_context *ctx, const char *path)
+{
+    size_t size;
+    if (disti_enter(ctx, "dist_net_load_file") != DIST_OK) return NULL;
+    unsigned char *bytes = disti_file_read(ctx, "dist_net_load_file", path, &size);
+    if (!bytes) return NULL;
+    dist_net *net = dist_net_load(ctx, bytes, size);
+    disti_free(ctx, bytes, size);
+    return net;
+}
+
+DIST_API dist_status dist_net_save_file(dist_context *ctx, const dist_net *net, const char *path)
+{
+    size_t size;
+    dist_status status = dist_net_save(ctx, net, NULL, 0, &size);
+    if (status != DIST_OK) return status;
+    unsigned char *bytes = (unsigned char *)disti_alloc(ctx, size);
+    if (!bytes) return DIST_OUT_OF_MEMORY;
+    status = dist_net_save(ctx, net, bytes, size, &size);
+    if (status == DIST_OK) status = disti_file_write(ctx, "dist_net_save_file", path, bytes, size);
+    disti_free(ctx, bytes, size);
+    return status;
+}
+#endif
+
+#ifndef DIST_NO_TRAIN
+/* splitmix64: uniform in [0, 1) and, by Box and Muller, standard normal. */
+static double disti_uniform(uint64_t *state)
+{
+    uint64_t z = *state += 0x9e3779b97f4a7c15u;
+    z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9u;
+    z = (z ^ (z >> 27)) * 0x94d049bb133111ebu;
+    return (double)((z ^ (z >> 31)) >> 11) * (1.0 / 9007199254740992.0);
+}
+
+static double disti_normal(uint64_t *state)
+{
+    double u = disti_uniform(state), v = disti_uniform(state);
+    double s, c;
+    disti_sincos(6.28318530717958647692 * v, &s, &c);
+    return sqrt(-2.0 * log(1.0 - u)) * c;
+}
+
+/* PyTorch's start: uniform within 1 / sqrt(in). SIREN's: within 1 / in at first, sqrt(6 / in) / omega then.
+   Geometric (Atzmon and Lipman 2020): normal with sigma sqrt(2 / out), the last layer's mean sqrt(pi / in), bias -radius;
+   code and skipped-in columns 0, so that f starts near |p| - radius. */
+static void disti_net_randomize(dist_net *net, const dist_net_desc *desc)
+{
+    uint64_t state = ((uint64_t)desc->seed << 1 | 1) * 0x9e3779b97f4a7c15u;
+    for (int l = 0; l < net->layers; l++) {
+        const disti_linear *layer = &net->layer[l];
+        int last = l + 1 == net->layers, sine = net->activation == DIST_ACTIVATION_SINE;
+        double in = layer->in;
+        double range = sine ? (l == 0 ? 1.0 / in : sqrt(6.0 / in) / (double)net->scale) : 1.0 / sqrt(in);
+        for (int o = 0; o < layer->out; o++) {
+            float *w = net->params + layer->weight + (size_t)o * (size_t)layer->in;
+            for (int k = 0; k < layer->in; k++) {
+                int is_code = k >= layer->code_column && k < layer->code_column + layer->code;
+                int is_point = k >= layer->point_column && k < layer->point_column + layer->point;
+                double x = (2.0 * disti_uniform(&state) - 1.0) * range;
+                if (desc->geometric) {
+                    x = last ? sqrt(3.14159265358979 / in) + 1e-4 * disti_normal(&state) : disti_normal(&state) * sqrt(2.0 / layer->out);
+                    if (is_code || (l > 0 && is_point)) x = 0.0;
+                }
+                w[k] = (float)x;
+            }
+            double b = (2.0 * disti_uniform(&state) - 1.0) * range;
+            net->params[layer->bias + (size_t)o] = desc->geometric ? (last ? -0.5f * net->bound : 0.0f) : (float)b;
+        }
+    }
+}
+
+static dist_status disti_net_desc_check(dist_context *ctx, const dist_net_desc *d)
+{
+    const char *name = "dist_net_create";
+    if (d->layers < 1 || d->layers >= DISTI_MAX_LAYERS)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: layers is %d, must be 1 to 31", name, d->layers, 0);
+    if (d->width < 1 || d->width > 4096)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: width is %d, must be 1 to 4096", name, d->width, 0);
+    if (d->skip < 0 || d->skip >= d->layers)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: skip is %d, must be 0 or a hidden layer below %d", name, d->skip, d->layers);
+    if (d->code_size < 0 || d->code_size > 4096 || d->code_count < 0 || d->code_count > 10000000)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: code_size is %d, code_count %d; at most 4096 and 1e7", name, d->code_size, d->code_count);
+    if (d->activation < DIST_ACTIVATION_RELU || d->activation > DIST_ACTIVATION_NONE)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: activation is %d, must be a DIST_ACTIVATION_ constant", name, d->activation, 0);
+    if (!disti_finite(d->scale) || d->scale <= 0.0f || !disti_finite(d->bound) || d->bound <= 0.0f || !disti_finite(d->clamp) || d->clamp < 0.0f)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: scale is %d, bound %d; both, and clamp, must be finite and not negative",
+                          name, (double)d->scale, (double)d->bound);
+    return DIST_OK;
+}
+
+DIST_API dist_net *dist_net_create(dist_context *ctx, const dist_net_desc *desc)
+{
+    dist_net_desc d;
+    int skip[DISTI_MAX_LAYERS];
+    if (disti_enter(ctx, "dist_net_create") != DIST_OK) return NULL;
+    memset(&d, 0, sizeof d);
+    if (desc) d = *desc;
+    if (d.layers == 0) d.layers = 8;
+    if (d.width == 0) d.width = 512;
+    if (d.scale == 0.0f) d.scale = d.activation == DIST_ACTIVATION_SINE ? 30.0f : 100.0f;
+    if (d.bound == 0.0f) d.bound = 1.0f;
+    if (d.clamp == 0.0f && d.code_size > 0) d.clamp = 0.1f;
+    if (disti_net_desc_check(ctx, &d) != DIST_OK) return NULL;
+    dist_net *net = disti_net_new(ctx);
+    if (!net) return NULL;
+    memset(skip, 0, sizeof skip);
+    skip[d.skip] = d.skip > 0;
+    net->layers = d.layers + 1;
+    net->channels = 1;
+    net->sdf_channel = 0;
+    memcpy(net->channel_names[0], "sdf", 4);
+    net->raw = 1;
+    net->point_size = 3;
+    net->code_size = d.code_size;
+    net->code_count = d.code_size > 0 ? d.code_count : 0;
+    net->activation = d.activation;
+    if (d.activation == DIST_ACTIVATION_SOFTPLUS || d.activation == DIST_ACTIVATION_SINE) net->first_scale = net->scale = d.scale;
+    net->output = d.output_linear ? DISTI_OUTPUT_NONE : DISTI_OUTPUT_TANH;
+    net->bound = d.bound;
+    net->clamp = d.clamp;
+    net->norm_epsilon = 1e-5f;
+    for (int l = 0; l < net->layers; l++) {
+        net->layer[l].out = l + 1 == net->layers ? 1 : d.width;
+        net->layer[l].in = (l > 0 ? d.width : 0) + (l == 0 || skip[l] ? 3 + d.code_size : 0);
+    }
+    if (disti_net_arrange(ctx, net, "dist_net_create", skip, 1.0f) != DIST_OK) {
+        dist_net_destroy(net);
+        return NULL;
+    }
+    disti_net_randomize(net, &d);
+    if (net->codes) memset(net->codes, 0, (size_t)net->code_count * (size_t)net->code_size * sizeof(float));
+    disti_net_pack(net);
+    return net;
+}
+
+DIST_API dist_status dist_net_set_weights(dist_context *ctx, dist_net *net, const float *weights)
+{
+    dist_status status = disti_enter(ctx, "dist_net_set_weights");
+    if (status != DIST_OK) return status;
+    if (!net || !weights)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_net_set_weights: %s is NULL", net ? "weights" : "net", 0, 0);
+    for (size_t i = 0; i < net->param_count; i++)
+        if (!disti_finite(weights[i]))
+            return disti_fail(ctx, DIST_NOT_FINITE, "dist_net_set_weights: weights[%d] is %d, must be finite", NULL, (double)i,
+                              (double)weights[i]);
+    memcpy(net->params, weights, net->param_count * sizeof(float));
+    disti_net_pack(net);
+    return DIST_OK;
+}
+
+DIST_API dist_status dist_net_set_code(dist_context *ctx, dist_net *net, int index, const float *code)
+{
+    dist_status status = disti_enter(ctx, "dist_net_set_code");
+    if (status != DIST_OK) return status;
+    if (!net || !code || index < 0 || index >= net->code_count)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_net_set_code: index is %d of %d codes; net and code must not be NULL", NULL,
+                          index, net ? net->code_count : 0);
+    if (!disti_finite_all((size_t)net->code_size, code))
+        return disti_fail(ctx, DIST_NOT_FINITE, "dist_net_set_code: code must be finite", NULL, 0, 0);
+    memcpy(net->codes + (size_t)index * (size_t)net->code_size, code, (size_t)net->code_size * sizeof(float));
+    return DIST_OK;
+}
+#endif
+
+/*@ 06 camera -------------------------------------------------------------------------------------------------------------- */
+
+/* b = M a and b = M^T a, 3 x 3 row-major. */
+static void disti_rotate(const double m[9], const double a[3], double b[3])
+{
+    for (int i = 0; i < 3; i++) b[i] = m[3 * i] * a[0] + m[3 * i + 1] * a[1] + m[3 * i + 2] * a[2];
+}
+
+static void disti_rotate_back(const double m[9], const double a[3], double b[3])
+{
+    for (int i = 0; i < 3; i++) b[i] = m[i] * a[0] + m[3 + i] * a[1] + m[6 + i] * a[2];
+}
+
+static double disti_dot(const double a[3], const double b[3])
+{
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
+
+static void disti_cross(const double a[3], const double b[3], double c[3])
+{
+    c[0] = a[1] * b[2] - a[2] * b[1];
+    c[1] = a[2] * b[0] - a[0] * b[2];
+    c[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+/* Scales to unit length; 0 and leaves it alone if that cannot be done. */
+static int disti_normalize(double a[3])
+{
+    double length = sqrt(disti_dot(a, a));
+    if (!(length > 1e-150)) return 0;
+    for (int i = 0; i < 3; i++) a[i] /= length;
+    return 1;
+}
+
+/* Rows of m to the nearest frame with the first two rows' plane kept (Gram and Schmidt, third by cross product). */
+static void disti_orthonormalize(double m[9])
+{
+    double along;
+    disti_normalize(m);
+    along = disti_dot(m, m + 3);
+    for (int i = 0; i < 3; i++) m[3 + i] -= along * m[i];
+    disti_normalize(m + 3);
+    disti_cross(m, m + 3, m + 6);
+}
+
+/* What the tracer and the adjoint use of a camera, in double. */
+typedef struct disti_view {
+    double rotation[9], translation[3], center[3]; /* center = -R^T t */
+    double fx, fy, cx, cy, skew, first;
+    int width, height;
+} disti_view;
+
+static void disti_view_of(const dist_camera *camera, disti_view *view)
+{
+    double minus[3];
+    for (int i = 0; i < 9; i++) view->rotation[i] = (double)camera->rotation[i];
+    disti_orthonormalize(view->rotation); /* float rounding alone would move a far camera's center */
+    for (int i = 0; i < 3; i++) view->translation[i] = (double)camera->translation[i];
+    for (int i = 0; i < 3; i++) minus[i] = -view->translation[i];
+    disti_rotate_back(view->rotation, minus, view->center);
+    view->fx = (double)camera->fx;
+    view->fy = (double)camera->fy;
+    view->cx = (double)camera->cx;
+    view->cy = (double)camera->cy;
+    view->skew = (double)camera->skew;
+    view->first = (double)camera->pixel_center;
+    view->width = camera->width;
+    view->height = camera->height;
+}
+
+/* Unit direction in camera space of the pixel with index (x, y): normalize(K^-1 (u, v, 1)), u = x + pixel_center. */
+static void disti_view_direction(const disti_view *view, double x, double y, double direction[3])
+{
+    direction[1] = (y + view->first - view->cy) / view->fy;
+    direction[0] = (x + view->first - view->cx - view->skew * direction[1]) / view->fx;
+    direction[2] = 1.0;
+    disti_normalize(direction);
+}
+
+static dist_status disti_camera_check(dist_context *ctx, const dist_camera *camera, const char *function)
+{
+    if (!camera) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: camera is NULL", function, 0, 0);
+    if (camera->width < 1 || camera->width > 65536 || camera->height < 1 || camera->height > 65536)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: camera is %d x %d pixels, each side must be 1 to 65536", function,
+                          camera->width, camera->height);
+    if (!disti_finite(camera->fx) || !disti_finite(camera->fy) || !(camera->fx * camera->fx > 0.0f) || !(camera->fy * camera->fy > 0.0f))
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: camera.fx is %d, fy %d; must be finite and not 0", function,
+                          (double)camera->fx, (double)camera->fy);
+    if (!disti_finite(camera->cx) || !disti_finite(camera->cy) || !disti_finite(camera->skew) || !disti_finite(camera->pixel_center))
+        return disti_fail(ctx, DIST_NOT_FINITE, "%s: camera.cx, cy, skew and pixel_center must be finite", function, 0, 0);
+    if (!disti_finite_all(9, camera->rotation) || !disti_finite_all(3, camera->translation))
+        return disti_fail(ctx, DIST_NOT_FINITE, "%s: camera.rotation and translation must be finite", function, 0, 0);
+    double m[9], c[3], worst = 0.0;
+    for (int i = 0; i < 9; i++) m[i] = (double)camera->rotation[i];
+    for (int i = 0; i < 3; i++) {
+        for (int j = i; j < 3; j++) {
+            double d = disti_dot(m + 3 * i, m + 3 * j) - (i == j ? 1.0 : 0.0);
+            worst = DISTI_MAX(worst, d < 0.0 ? -d : d);
+        }
+    }
+    disti_cross(m, m + 3, c);
+    if (worst > 1e-3 || disti_dot(c, m + 6) < 0.0)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT,
+                          "%s: camera.rotation is not a rotation (rows off orthonormal by %d, determinant %d); see dist_camera_move",
+                          function, worst, disti_dot(c, m + 6));
+    return DIST_OK;
+}
+
+/* rows of camera->rotation: right, down, forward */
+static void disti_camera_place(dist_camera *camera, const double m[9], const double center[3])
+{
+    double t[3];
+    disti_rotate(m, center, t);
+    for (int i = 0; i < 9; i++) camera->rotation[i] = (float)m[i];
+    for (int i = 0; i < 3; i++) camera->translation[i] = (float)-t[i];
+}
+
+DIST_API dist_camera dist_camera_look_at(int width, int height, float fov_y, const float eye[3], const float at[3], const float up[3])
+{
+    dist_camera camera;
+    double m[9], center[3], down[3] = {0.0, -1.0, 0.0};
+    memset(&camera, 0, sizeof camera);
+    camera.width = width;
+    camera.height = height;
+    camera.fx = camera.fy = (float)(height / 2.0 / tan((double)fov_y / 2.0));
+    camera.cx = (float)((width - 1) / 2.0);
+    camera.cy = (float)((height - 1) / 2.0);
+    for (int i = 0; i < 3; i++) {
+        center[i] = eye ? (double)eye[i] : 0.0;
+        m[6 + i] = (at ? (double)at[i] : 0.0) - center[i];
+        if (up) down[i] = -(double)up[i];
+    }
+    if (!disti_normalize(m + 6)) m[6] = 0.0, m[7] = 0.0, m[8] = 1.0;
+    disti_cross(down, m + 6, m); /* right = down x forward */
+    double size = sqrt(disti_dot(down, down));
+    if (!(sqrt(disti_dot(m, m)) > 1e-6 * size) || !disti_normalize(m)) {
+        int least = fabs(m[6]) < fabs(m[7]) ? (fabs(m[6]) < fabs(m[8]) ? 0 : 2) : (fabs(m[7]) < fabs(m[8]) ? 1 : 2);
+        for (int i = 0; i < 3; i++) down[i] = i == least ? -1.0 : 0.0;
+        disti_cross(down, m + 6, m);
+        disti_normalize(m);
+    }
+    disti_cross(m + 6, m, m + 3);
+    disti_camera_place(&camera, m, center);
+    return camera;
+}
+
+/* OpenGL's camera axes are ours with y and z turned over: R = (diag(1, -1, -1)) (rotation of camera_to_world)^T. */
+DIST_API void dist_camera_set_opengl(dist_camera *camera, const float camera_to_world[12])
+{
+    double m[9], center[3];
+    if (!camera || !camera_to_world) return;
+    for (int i = 0; i < 3; i++) {
+        for (int j = 0; j < 3; j++) m[3 * i + j] = (double)camera_to_world[4 * j + i] * (i == 0 ? 1.0 : -1.0);
+        center[i] = (double)camera_to_world[4 * i + 3];
+    }
+    disti_camera_place(camera, m, center);
+}
+
+DIST_API void dist_camera_get_opengl(const dist_camera *camera, float camera_to_world[12])
+{
+    disti_view view;
+    if (!camera || !camera_to_world) return;
+    disti_view_of(camera, &view);
+    for (int i = 0; i < 3; i++) {
+        for (int j = 0; j < 3; j++) camera_to_world[4 * j + i] = (float)(view.rotation[3 * i + j] * (i == 0 ? 1.0 : -1.0));
+        camera_to_world[4 * i + 3] = (float)view.center[i];
+    }
+}
+
+DIST_API dist_status dist_camera_set_colmap(dist_camera *camera, const float quaternion[4], const float translation[3])
+{
+    if (!camera || !quaternion || !translation) return DIST_BAD_ARGUMENT;
+    if (!disti_finite_all(4, quaternion) || !disti_finite_all(3, translation)) return DIST_NOT_FINITE;
+    double q[4], length = 0.0;
+    for (int i = 0; i < 4; i++) length += (double)quaternion[i] * (double)quaternion[i];
+    if (!(length > 1e-30)) return DIST_BAD_ARGUMENT;
+    for (int i = 0; i < 4; i++) q[i] = (double)quaternion[i] / sqrt(length);
+    double w = q[0], x = q[1], y = q[2], z = q[3];
+    double m[9] = {1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), 2 * (x * y + w * z), 1 - 2 * (x * x + z * z),
+                   2 * (y * z - w * x), 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)};
+    for (int i = 0; i < 9; i++) camera->rotation[i] = (float)m[i];
+    memcpy(camera->translation, translation, sizeof camera->translation);
+    camera->pixel_center = 0.5f;
+    return DIST_OK;
+}
+
+/* Shepperd's way: the largest of the four squares is divided by. */
+DIST_API void dist_camera_get_colmap(const dist_camera *camera, float quaternion[4], float translation[3])
+{
+    if (!camera || !quaternion || !translation) return;
+    const float *m = camera->rotation;
+    double trace = (double)m[0] + (double)m[4] + (double)m[8];
+    double s[4] = {trace, (double)m[0], (double)m[4], (double)m[8]}, q[4];
+    int best = 0;
+    for (int i = 1; i < 4; i++) best = s[i] > s[best] ? i : best;
+    double off[3] = {(double)m[7] - (double)m[5], (double)m[2] - (double)m[6], (double)m[3] - (double)m[1]};
+    if (best == 0) {
+        q[0] = 1.0 + trace;
+        for (int i = 0; i < 3; i++) q[1 + i] = off[i];
+    } else {
+        int i = best - 1, j = (i + 1) % 3, k = (i + 2) % 3;
+        q[1 + i] = 1.0 + 2.0 * s[best] - trace;
+        q[1 + j] = (double)m[3 * i + j] + (double)m[3 * j + i];
+        q[1 + k] = (double)m[3 * i + k] + (double)m[3 * k + i];
+        q[0] = off[i];
+    }
+    double length = sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]) * (q[0] < 0.0 ? -1.0 : 1.0);
+    for (int i = 0; i < 4; i++) quaternion[i] = (float)(q[i] / length);
+    memcpy(translation, camera->translation, sizeof camera->translation);
+}
+
+/* Rodrigues: exp([w]x) = I + a [w]x + b [w]x^2, a = sin|w| / |w|, b = (1 - cos|w|) / |w|^2. */
+DIST_API void dist_camera_move(dist_camera *camera, const float w[3], const float t[3])
+{
+    if (!camera) return;
+    if (w) {
+        double v[3] = {(double)w[0], (double)w[1], (double)w[2]}, m[9], r[9], s, c;
+        double angle = sqrt(disti_dot(v, v));
+        disti_sincos(angle, &s, &c);
+        double a = angle > 1e-8 ? s / angle : 1.0, b = angle > 1e-4 ? (1.0 - c) / (angle * angle) : 0.5;
+        double e[9] = {c + b * v[0] * v[0], b * v[0] * v[1] - a * v[2], b * v[0] * v[2] + a * v[1],
+                       b * v[0] * v[1] + a * v[2], c + b * v[1] * v[1], b * v[1] * v[2] - a * v[0],
+                       b * v[0] * v[2] - a * v[1], b * v[1] * v[2] + a * v[0], c + b * v[2] * v[2]};
+        for (int i = 0; i < 9; i++) m[i] = (double)camera->rotation[i];
+        for (int i = 0; i < 3; i++)
+            for (int j = 0; j < 3; j++) r[3 * i + j] = e[3 * i] * m[j] + e[3 * i + 1] * m[3 + j] + e[3 * i + 2] * m[6 + j];
+        disti_orthonormalize(r);
+        for (int i = 0; i < 9; i++) camera->rotation[i] = (float)r[i];
+    }
+    for (int i = 0; t && i < 3; i++) camera->translation[i] += t[i];
+}
+
+DIST_API void dist_camera_ray(const dist_camera *camera, float x, float y, float origin[3], float direction[3])
+{
+    disti_view view;
+    double v[3], world[3];
+    if (!camera) return;
+    disti_view_of(camera, &view);
+    disti_view_direction(&view, (double)x, (double)y, v);
+    disti_rotate_back(view.rotation, v, world);
+    for (int i = 0; i < 3; i++) {
+        if (origin) origin[i] = (float)view.center[i];
+        if (direction) direction[i] = (float)world[i];
+    }
+}
+
+/*@ 07 trace --------------------------------------------------------------------------------------------------------------- */
+
+/* A ray in the field's space, p(s) = origin + s direction, with origin the point closest to the bounding sphere's center,
+   so that s stays within the radius however far the camera is; distance along the ray = base + s. */
+typedef struct disti_ray {
+    double base;
+    float origin[3], direction[3];
+    float enter, leave; /* of the bounding sphere, not before the camera; enter >= leave: it is not met */
+    float footprint;    /* half a pixel's width at unit distance: t cos^2 / (2 f)                       (paper, supplement) */
+    float q;            /* where f is wanted next */
+    float s, f;         /* front: nothing lies before it */
+    float slope;        /* df/ds of the last two samples */
+    float a, fa, b, fb; /* bracket: fa > 0 >= fb, a < b */
+    float width;        /* bracket's width two queries ago */
+    float best, fbest;  /* sample of smallest |f| */
+    float error;
+    float sign;         /* -1: looking for the way out of the solid */
+    unsigned short steps;
+    unsigned char mode, status;
+    unsigned char side; /* bracket: queries since its width was noted; band: queries in it */
+    unsigned char moved; /* bracket: its end that moved last, 1 b, 2 a, 3 b twice; band: 1 if the ray came into it from outside */
+} disti_ray;
+
+enum { DISTI_DONE, DISTI_FIRST, DISTI_MARCH, DISTI_JUMP, DISTI_BACK, DISTI_BAND, DISTI_BRACKET, DISTI_CONES };
+
+/* What one call traces with. */
+typedef struct disti_tracer {
+    dist_context *ctx;
+    const dist_field *field;
+    dist_render_desc how;
+    float lipschitz, epsilon, noise;
+} disti_tracer;
+
+DIST_API dist_render_desc dist_render_desc_resolve(const dist_render_desc *desc)
+{
+    dist_render_desc how;
+    memset(&how, 0, sizeof how);
+    if (desc) how = *desc;
+    if (how.max_steps == 0) how.max_steps = how.trace == DIST_TRACE_PAPER ? 50 : 100;
+    if (how.step_scale == 0.0f) how.step_scale = 1.5f;
+    if (how.epsilon == 0.0f && how.trace == DIST_TRACE_PAPER) how.epsilon = 5e-5f;
+    if (how.samples == 0) how.samples = 1;
+    if (how.gradient == DIST_GRADIENT_AUTO) how.gradient = how.trace == DIST_TRACE_PAPER ? DIST_GRADIENT_PAPER : DIST_GRADIENT_NORMAL;
+    if (how.gradient_cap == 0.0f) how.gradient_cap = 0.1f;
+    if (how.normal_delta == 0.0f) how.normal_delta = 1e-3f;
+    return how;
+}
+
+static dist_status disti_choice(dist_context *ctx, const char *function, const char *field, int value, int most)
+{
+    if (value >= 0 && value <= most) return DIST_OK;
+    char text[96];
+    size_t n = strlen(function), m = strlen(field);
+    memcpy(text, function, n);
+    memcpy(text + n, ": how.", 6);
+    memcpy(text + n + 6, field, m + 1);
+    return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s is %d, must be 0 to %d", text, value, most);
+}
+
+static dist_status disti_how_check(dist_context *ctx, const dist_render_desc *how, const char *function)
+{
+    dist_status status;
+    if ((status = disti_choice(ctx, function, "max_steps", how->max_steps, 60000)) != DIST_OK) return status;
+    if ((status = disti_choice(ctx, function, "samples", how->samples, 8)) != DIST_OK) return status;
+    if ((status = disti_choice(ctx, function, "trace", how->trace, DIST_TRACE_PAPER)) != DIST_OK) return status;
+    if ((status = disti_choice(ctx, function, "paper_row", how->paper_row, DIST_PAPER_PARALLEL)) != DIST_OK) return status;
+    if ((status = disti_choice(ctx, function, "gradient", how->gradient, DIST_GRADIENT_PAPER)) != DIST_OK) return status;
+    if ((status = disti_choice(ctx, function, "normal_mode", how->normal_mode, DIST_NORMAL_DIFFERENCE)) != DIST_OK) return status;
+    if ((status = disti_choice(ctx, function, "normal_space", how->normal_space, DIST_SPACE_WORLD)) != DIST_OK) return status;
+    if ((status = disti_choice(ctx, function, "inside", how->inside, DIST_INSIDE_EXIT)) != DIST_OK) return status;
+    if ((status = disti_choice(ctx, function, "no_cones", how->no_cones, 1)) != DIST_OK) return status;
+    if (!disti_finite(how->step_scale) || how->step_scale < 0.0f || how->step_scale > 100.0f)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.step_scale is %d, must be above 0 (0: the default) and at most 100", function, (double)how->step_scale, 0);
+    if (!disti_finite(how->epsilon) || how->epsilon < 0.0f)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.epsilon is %d, must be 0 or positive", function, (double)how->epsilon, 0);
+    if (!disti_finite(how->gradient_cap) || how->gradient_cap < 0.0f || how->gradient_cap > 1.0f)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.gradient_cap is %d, must be 0 to 1", function, (double)how->gradient_cap, 0);
+    if (!disti_finite(how->normal_delta) || how->normal_delta < 0.0f)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.normal_delta is %d, must be 0 or positive", function, (double)how->normal_delta, 0);
+    if (!disti_finite(how->lipschitz) || how->lipschitz < 0.0f)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.lipschitz is %d, must be 0 or positive", function, (double)how->lipschitz, 0);
+    if (!disti_finite(how->background) || !disti_finite_all(3, how->background_color))
+        return disti_fail(ctx, DIST_NOT_FINITE, "%s: how.background and background_color must be finite", function, 0, 0);
+#ifdef DIST_NO_PAPER
+    if (how->trace == DIST_TRACE_PAPER)
+        return disti_fail(ctx, DIST_UNSUPPORTED, "%s: this build has DIST_NO_PAPER, so no DIST_TRACE_PAPER", function, 0, 0);
+#endif
+    return DIST_OK;
+}
+
+static dist_status disti_tracer_init(disti_tracer *tracer, dist_context *ctx, const dist_field *field, const dist_render_desc *desc,
+                                     const char *function)
+{
+    dist_render_desc raw;
+    memset(&raw, 0, sizeof raw);
+    if (desc) raw = *desc;
+    dist_status status = disti_how_check(ctx, &raw, function);
+    if (status != DIST_OK) return status;
+    tracer->ctx = ctx;
+    tracer->field = field;
+    tracer->how = dist_render_desc_resolve(desc);
+    if (!desc || desc->normal_delta == 0.0f) tracer->how.normal_delta = 1e-3f * field->radius;
+    tracer->lipschitz = tracer->how.lipschitz > 0.0f ? tracer->how.lipschitz : field->lipschitz > 0.0f ? field->lipschitz : 1.0f;
+    tracer->noise = 5e-7f * field->radius;
+    tracer->epsilon = DISTI_MAX(tracer->how.epsilon, tracer->how.epsilon > 0.0f ? tracer->noise : 0.0f);
+    return DIST_OK;
+}
+
+/* center and direction (unit) of the ray in the field's space. The closest approach is found in double: a float's squared
+   distance is off by more than epsilon from 30 radii on. */
+static void disti_ray_init(const dist_field *field, const double center[3], const double direction[3], double footprint, disti_ray *ray)
+{
+    double c[3], square = 0.0, radius = (double)field->radius;
+    memset(ray, 0, sizeof *ray);
+    for (int i = 0; i < 3; i++) c[i] = center[i] - (double)field->center[i];
+    double along = -disti_dot(c, direction);
+    for (int i = 0; i < 3; i++) {
+        double o = c[i] + along * direction[i];
+        square += o * o;
+        ray->origin[i] = (float)(o + (double)field->center[i]);
+        ray->direction[i] = (float)direction[i];
+    }
+    ray->base = along;
+    ray->footprint = (float)footprint;
+    ray->sign = 1.0f;
+    ray->fbest = 3e38f;
+    double half = radius * radius - square;
+    half = half > 0.0 ? sqrt(half) : -1.0;
+    ray->leave = (float)half;
+    ray->enter = (float)(-half > -along ? -half : -along); /* nothing behind the camera */
+    ray->s = ray->best = ray->enter;
+    ray->status = DIST_RAY_MISS;
+    ray->mode = half > 0.0 && ray->enter < ray->leave ? DISTI_FIRST : DISTI_DONE;
+    if (ray->mode == DISTI_DONE) ray->leave = ray->enter;
+    ray->q = ray->enter;
+}
+
+/* |f| that counts as the surface at s: epsilon, but no more than half a pixel there, and no less than float's noise. */
+static float disti_ray_epsilon(const disti_tracer *tracer, const disti_ray *ray, float s)
+{
+    if (tracer->epsilon > 0.0f) return tracer->epsilon;
+    float pixel = (float)(ray->base + (double)s) * ray->footprint;
+    float epsilon = 5e-5f * tracer->field->radius;
+    epsilon = ray->footprint > 0.0f && pixel < epsilon ? pixel : epsilon;
+    return DISTI_MAX(epsilon, tracer->noise);
+}
+
+static int disti_ray_end(disti_ray *ray, int status, float s, float f, float error)
+{
+    ray->status = (unsigned char)status;
+    ray->mode = DISTI_DONE;
+    ray->best = s;
+    ray->fbest = f * ray->sign;
+    ray->error = error;
+    return 0;
+}
+
+static int disti_ray_ask(disti_ray *ray, int mode, float q)
+{
+    ray->mode = (unsigned char)mode;
+    ray->q = q;
+    return 1;
+}
+
+/* Bracket [a, b], fa > 0 >= fb: regula falsi with Illinois' halving of the end that stays; a bisection whenever three queries
+   did not halve it. So slope, clamp and kinks cannot make it oscillate, and equal ends cannot divide by 0. */
+static int disti_ray_bracket(const disti_tracer *tracer, disti_ray *ray)
+{
+    float width = ray->b - ray->a;
+    float tolerance = 0.25f * disti_ray_epsilon(tracer, ray, ray->a);
+    float spacing = 2.4e-7f * tracer->field->radius; /* s has no finer steps */
+    float q = ray->a + width * (ray->fa / (ray->fa - ray->fb));
+    if (width <= DISTI_MAX(tolerance, spacing)) return disti_ray_end(ray, DIST_RAY_HIT, q, 0.0f, width);
+    int lopsided = ray->moved == 3 && -ray->fb < 0.01f * ray->fa && width > 64.0f * tolerance; /* f is flat beyond: regula falsi would crawl */
+    if (lopsided || (ray->side >= 3 && width > 0.5f * ray->width)) {
+        q = 0.5f * (ray->a + ray->b);
+        ray->side = 0;
+    }
+    if (ray->side == 0) ray->width = width;
+    ray->side++;
+    float least = DISTI_MIN(0.5f * tolerance, 0.25f * width);
+    q = DISTI_MAX(q, ray->a + least);
+    q = DISTI_MIN(q, ray->b - least);
+    return disti_ray_ask(ray, DISTI_BRACKET, q);
+}
+
+/* A sample inside the bracket. The error is judged in s: |f| over the slope across the bracket. */
+static int disti_ray_bracketed(const disti_tracer *tracer, disti_ray *ray, float f)
+{
+    float tolerance = 0.25f * disti_ray_epsilon(tracer, ray, ray->q);
+    float slope_a = (ray->fa - f) / (ray->q - ray->a), slope_b = (f - ray->fb) / (ray->b - ray->q);
+    int inside = f <= 0.0f;
+    float slope = inside ? slope_a : slope_b;
+    float other = inside ? slope_b : slope_a;
+    float magnitude = f < 0.0f ? -f : f;
+    if (magnitude <= tolerance * slope * 0.5f && magnitude <= tolerance * (other > 0.0f ? other : -other)) {
+        float s = ray->q + f / slope; /* one secant correction without a query */
+        float error = magnitude / DISTI_MIN(slope, other > 0.0f ? other : -other);
+        return disti_ray_end(ray, DIST_RAY_HIT, s, 0.0f, error);
+    }
+    if (inside) {
+        ray->b = ray->q;
+        ray->fb = f;
+        if (ray->moved & 1) ray->fa *= 0.5f;
+        ray->moved = ray->moved & 1 ? 3 : 1;
+    } else {
+        ray->a = ray->q;
+        ray->fa = f;
+        if (ray->moved == 2) ray->fb *= 0.5f;
+        ray->moved = 2;
+    }
+    return disti_ray_bracket(tracer, ray);
+}
+
+static int disti_ray_open_bracket(const disti_tracer *tracer, disti_ray *ray, float a, float fa, float b, float fb)
+{
+    ray->a = a;
+    ray->fa = fa;
+    ray->b = b;
+    ray->fb = fb;
+    ray->side = ray->moved = 0;
+    return disti_ray_bracket(tracer, ray);
+}
+
+/* Steps no shorter than this are taken along a surface that the ray hardly approaches. They grow from the 20th query on, so
+   that a plateau of f ends within the budget. */
+static float disti_ray_floor(const disti_tracer *tracer, const disti_ray *ray)
+{
+    float patience = ray->steps > 20 ? 1.0f + 0.1f * (float)(ray->steps - 20) : 1.0f;
+    return 5e-4f * patience * tracer->field->radius;
+}
+
+/* Where to look next from the front: near the surface a jump to where the last slope says that f ends, at most three spheres
+   far; else a sphere step, stretched by what the slope allows: for a plane that recedes or comes at the angle seen,
+   2 / (1 - slope) (auto-relaxation). What is found there is checked on arrival. */
+static int disti_ray_step(const disti_tracer *tracer, disti_ray *ray)
+{
+    float radius = ray->f / tracer->lipschitz;
+    float epsilon = disti_ray_epsilon(tracer, ray, ray->s);
+    float slope = ray->slope / tracer->lipschitz;
+    if (ray->s + radius >= ray->leave) return disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest * ray->sign, 0.0f);
+    float stretch = ray->steps < 2 ? tracer->how.step_scale : DISTI_MAX(1.0f, 2.0f / (1.0f - DISTI_MIN(slope, 0.75f)));
+    float step = radius * DISTI_MIN(stretch, 8.0f);
+    int mode = DISTI_MARCH;
+    if (ray->steps >= 2 && slope < -0.05f && ray->f < 0.05f * tracer->field->radius) {
+        float jump = 1.1f * ray->f / -ray->slope + 0.5f * epsilon;
+        step = DISTI_MIN(jump, 3.0f * radius + epsilon);
+        mode = DISTI_JUMP;
+    }
+    if (ray->steps >= 2 && slope > -0.3f) step = DISTI_MAX(step, disti_ray_floor(tracer, ray));
+    float q = ray->s + step;
+    float spacing = ray->s + 2.4e-7f * tracer->field->radius;
+    q = DISTI_MAX(q, spacing);
+    return disti_ray_ask(ray, mode, DISTI_MIN(q, ray->leave));
+}
+
+/* A step that the spheres of radius f / L at its two ends do not cover is taken back, unless it is too short to matter or it
+   followed a surface at a low angle and found f about where the slope said. */
+static int disti_ray_trusts(const disti_tracer *tracer, const disti_ray *ray, float f, float step)
+{
+    if (ray->slope > -0.3f * tracer->lipschitz && step <= 1.001f * disti_ray_floor(tracer, ray)) return 1;
+    float expected = ray->f + ray->slope * step;
+    float off = f - expected;
+    return ray->mode == DISTI_JUMP && expected > 0.0f && (off < 0.0f ? -off : off) < 0.3f * ray->f;
+}
+
+/* Feels ahead in the band 0 < f < epsilon, farther each time. */
+static int disti_ray_feel(const disti_tracer *tracer, disti_ray *ray, float epsilon)
+{
+    float reach = 2.0f * epsilon;
+    for (int i = 0; i < ray->side && reach < 0.01f * tracer->field->radius; i++) reach *= 1.5f;
+    if (ray->slope < -1e-3f) reach = DISTI_MIN(1.2f * ray->f / -ray->slope, DISTI_MAX(reach, 64.0f * epsilon));
+    float q = ray->s + DISTI_MAX(reach, 0.5f * epsilon);
+    q = DISTI_MAX(q, ray->s + 4.8e-7f * tracer->field->radius);
+    return disti_ray_ask(ray, DISTI_BAND, DISTI_MIN(q, ray->leave));
+}
+
+/* f < epsilon at the front without a crossing yet: it is a hit by the paper's rule, but a crossing close by is a better one.
+   Leaving the band again (by 4 epsilon) was a touch: a hit at its least f, unless the ray began there (no hit with the surface it starts
+   from). f that does not change at all is a plateau. The band's first sample stands in a, fa, its least in b, fb. */
+static int disti_ray_band(const disti_tracer *tracer, disti_ray *ray, float f)
+{
+    float epsilon = disti_ray_epsilon(tracer, ray, ray->s);
+    float slope = (f - ray->f) / DISTI_MAX(ray->q - ray->s, 1e-30f);
+    if (f <= 0.0f && ray->f > 0.0f) return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->q, f);
+    if (f < 0.0f) return disti_ray_end(ray, DIST_RAY_HIT, ray->s, 0.0f, 0.0f); /* the start is the surface, to the last bit */
+    ray->side++;
+    if (f < ray->fb) {
+        ray->b = ray->q;
+        ray->fb = f;
+    }
+    if (f >= 4.0f * epsilon || ray->q >= ray->leave) {
+        if (ray->moved) return disti_ray_end(ray, DIST_RAY_HIT, ray->b, ray->fb, ray->fb / tracer->lipschitz + (ray->q - ray->a));
+        ray->s = ray->q;
+        ray->f = f;
+        ray->slope = slope;
+        return ray->q >= ray->leave ? disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest * ray->sign, 0.0f)
+                                    : disti_ray_step(tracer, ray);
+    }
+    if (ray->side >= 16) {
+        float change = ray->fa - f;
+        if (change < 1e-3f * (ray->q - ray->a)) return disti_ray_end(ray, DIST_RAY_PLATEAU, ray->b, ray->fb, 0.0f);
+        return disti_ray_end(ray, DIST_RAY_HIT, ray->b, ray->fb, ray->fb * (ray->q - ray->a) / change);
+    }
+    ray->s = ray->q;
+    ray->f = f;
+    ray->slope = slope;
+    return disti_ray_feel(tracer, ray, epsilon);
+}
+
+/* The field is negative where the ray starts. */
+static int disti_ray_inside(const disti_tracer *tracer, disti_ray *ray, float f)
+{
+    if (tracer->how.inside == DIST_INSIDE_HIT) return disti_ray_end(ray, DIST_RAY_INSIDE, ray->enter, 0.0f, 0.0f);
+    if (tracer->how.inside == DIST_INSIDE_BACKGROUND) return disti_ray_end(ray, DIST_RAY_INSIDE, ray->enter, f, 0.0f);
+    ray->sign = -ray->sign;
+    ray->s = ray->enter;
+    ray->f = -f;
+    ray->best = ray->enter;
+    ray->fbest = f;
+    ray->slope = 0.0f;
+    return disti_ray_step(tracer, ray);
+}
+
+/* One sample f at ray->q: what follows from it. 1: another query at ray->q; 0: done, ray->status says how. */
+static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float sample)
+{
+    float f = sample * ray->sign, q = ray->q;
+    if (!disti_finite(sample)) return disti_ray_end(ray, DIST_RAY_NOT_FINITE, q, 0.0f, 0.0f);
+    float magnitude = sample < 0.0f ? -sample : sample;
+    float least = ray->fbest < 0.0f ? -ray->fbest : ray->fbest;
+    if (magnitude < least) {
+        ray->best = q;
+        ray->fbest = sample;
+    }
+    ray->steps++;
+    if (ray->mode == DISTI_BRACKET) {
+        if (ray->steps < tracer->how.max_steps + 40) return disti_ray_bracketed(tracer, ray, f);
+        return disti_ray_end(ray, DIST_RAY_HIT, 0.5f * (ray->a + ray->b), 0.0f, ray->b - ray->a);
+    }
+    if (ray->steps >= tracer->how.max_steps && f > 0.0f)
+        return disti_ray_end(ray, DIST_RAY_UNRESOLVED, ray->best, ray->fbest * ray->sign, 0.0f);
+    switch (ray->mode) {
+    case DISTI_FIRST:
+        if (f < 0.0f && q <= ray->enter) return disti_ray_inside(tracer, ray, f);
+        if (f < 0.0f) { /* the cone came too far: the Lipschitz figure was too small here */
+            ray->b = q;
+            ray->fb = f;
+            ray->width = DISTI_MAX(1.5f * -f / tracer->lipschitz, disti_ray_epsilon(tracer, ray, q));
+            return disti_ray_ask(ray, DISTI_BACK, DISTI_MAX(q - ray->width, ray->enter));
+        }
+        ray->s = q;
+        ray->f = f;
+        break;
+    case DISTI_BACK:
+        if (f >= 0.0f) return disti_ray_open_bracket(tracer, ray, q, f, ray->b, ray->fb);
+        if (q <= ray->enter) return disti_ray_inside(tracer, ray, f);
+        ray->b = q;
+        ray->fb = f;
+        ray->width *= 1.6f;
+        return disti_ray_ask(ray, DISTI_BACK, DISTI_MAX(q - ray->width, ray->enter));
+    case DISTI_BAND: return disti_ray_band(tracer, ray, f);
+    case DISTI_MARCH:
+    case DISTI_JUMP: {
+        if (f <= 0.0f) return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, q, f);
+        float radius = ray->f / tracer->lipschitz, step = q - ray->s;
+        float spacing = 4.8e-7f * tracer->field->radius;
+        if (step > radius + f / tracer->lipschitz && step > 1.0001f * radius + spacing && !disti_ray_trusts(tracer, ray, f, step)) {
+            float slope = (f - ray->f) / step;
+            ray->slope = DISTI_MAX(slope, -tracer->lipschitz);
+            return disti_ray_ask(ray, DISTI_MARCH, DISTI_MIN(ray->s + DISTI_MAX(radius, spacing), ray->leave));
+        }
+        ray->slope = (f - ray->f) / step;
+        ray->s = q;
+        ray->f = f;
+        break;
+    }
+    }
+    if (ray->f < disti_ray_epsilon(tracer, ray, ray->s)) {
+        ray->a = ray->b = ray->s;
+        ray->fa = ray->fb = ray->f;
+        ray->side = 0;
+        ray->moved = ray->slope < 0.0f; /* came down to here from farther out */
+        return disti_ray_feel(tracer, ray, disti_ray_epsilon(tracer, ray, ray->s));
+    }
+    if (ray->s >= ray->leave) return disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest * ray->sign, 0.0f);
+    return disti_ray_step(tracer, ray);
+}
+
+/* A worker's share of the tracer's memory. */
+enum { DISTI_TILE = 64, DISTI_TILE_RAYS = DISTI_TILE * DISTI_TILE };
+
+typedef struct disti_bench { /* the work bench of one task */
+    dist_stats *stats;
+    disti_ray *rays;   /* DISTI_TILE_RAYS */
+    float *points;     /* (DISTI_TILE_RAYS, 3) */
+    float *sdf;        /* DISTI_TILE_RAYS */
+    int *index;        /* DISTI_TILE_RAYS */
+    unsigned char *rest; /* what else a task wants: DISTI_REST_BYTES */
+} disti_bench;
+
+enum { DISTI_REST_BYTES = 128 * 1024 };
+
+static void disti_bench_init(const dist_context *ctx, int worker, disti_bench *bench)
+{
+    unsigned char *base = disti_scratch(ctx, worker) + DISTI_COUNTER_BYTES;
+    size_t at = 0;
+    bench->stats = (dist_stats *)disti_take(base, &at, 1, sizeof(dist_stats));
+    bench->rays = (disti_ray *)disti_take(base, &at, DISTI_TILE_RAYS, sizeof(disti_ray));
+    bench->points = (float *)disti_take(base, &at, DISTI_TILE_RAYS, 3 * sizeof(float));
+    bench->sdf = (float *)disti_take(base, &at, DISTI_TILE_RAYS, sizeof(float));
+    bench->index = (int *)disti_take(base, &at, DISTI_TILE_RAYS, sizeof(int));
+    bench->rest = (unsigned char *)disti_take(base, &at, DISTI_REST_BYTES, 1);
+    DIST_ASSERT(at <= DISTI_TRACE_BYTES);
+}
+
+static void disti_ray_point(const disti_ray *ray, float s, float p[3])
+{
+    for (int i = 0; i < 3; i++) p[i] = ray->origin[i] + s * ray->direction[i];
+}
+
+/* Marches all rays that are not done, in rounds: one packed batch of points a round. */
+static void disti_trace_rounds(const disti_tracer *tracer, int worker, const disti_bench *bench, size_t n)
+{
+    size_t active = 0;
+    for (size_t i = 0; i < n; i++)
+        if (bench->rays[i].mode != DISTI_DONE) bench->index[active++] = (int)i;
+    while (active > 0) {
+        size_t kept = 0;
+        for (size_t i = 0; i < active; i++) disti_ray_point(&bench->rays[bench->index[i]], bench->rays[bench->index[i]].q, bench->points + 3 * i);
+        tracer->field->eval_fn(tracer->field->user, worker, active, bench->points, bench->sdf, NULL);
+        bench->stats->queries += active;
+        for (size_t i = 0; i < active; i++) {
+            disti_ray *ray = &bench->rays[bench->index[i]];
+            if (ray->mode == DISTI_BRACKET || ray->mode == DISTI_BAND) bench->stats->refine_queries++;
+            else bench->stats->march_queries++;
+            if (disti_ray_advance(tracer, ray, bench->sdf[i])) bench->index[kept++] = bench->index[i];
+        }
+        active = kept;
+    }
+}
+
+static void disti_stats_begin(dist_context *ctx)
+{
+    for (int worker = 0; worker < ctx->workers; worker++) {
+        disti_bench bench;
+        disti_bench_init(ctx, worker, &bench);
+        memset(bench.stats, 0, sizeof *bench.stats);
+        memset(disti_counter_of(ctx, worker), 0, sizeof(disti_counter));
+    }
+}
+
+/* Counts are whole numbers and extremes: the order of the workers does not matter. */
+static void disti_stats_end(dist_context *ctx, const disti_tracer *tracer, dist_stats *out)
+{
+    if (!out) return;
+    memset(out, 0, sizeof *out);
+    out->epsilon = 3e38f;
+    for (int worker = 0; worker < ctx->workers; worker++) {
+        disti_bench bench;
+        disti_bench_init(ctx, worker, &bench);
+        const dist_stats *s = bench.stats;
+        out->rays += s->rays;
+        out->rays_in_sphere += s->rays_in_sphere;
+        out->queries += s->queries;
+        out->cone_queries += s->cone_queries;
+        out->march_queries += s->march_queries;
+        out->refine_queries += s->refine_queries;
+        out->silhouette_queries += s->silhouette_queries;
+        out->normal_queries += s->normal_queries;
+        out->hits += s->hits;
+        out->unresolved += s->unresolved;
+        out->inside += s->inside;
+        out->plateau += s->plateau;
+        out->not_finite += s->not_finite;
+        out->operations += disti_counter_of(ctx, worker)->dense;
+        out->operations_done += disti_counter_of(ctx, worker)->done;
+        out->error = DISTI_MAX(out->error, s->error);
+        if (s->epsilon > 0.0f) out->epsilon = DISTI_MIN(out->epsilon, s->epsilon);
+    }
+    if (out->epsilon > 1e38f) out->epsilon = tracer->epsilon > 0.0f ? tracer->epsilon : 5e-5f * tracer->field->radius;
+    out->lipschitz = tracer->lipschitz;
+}
+
+/* Mask of a finished ray: a hit, or a start inside the solid where that counts as one. */
+static int disti_ray_is_hit(const disti_tracer *tracer, const disti_ray *ray)
+{
+    return ray->status == DIST_RAY_HIT || (ray->status == DIST_RAY_INSIDE && tracer->how.inside == DIST_INSIDE_HIT);
+}
+
+static void disti_stats_ray(const disti_tracer *tracer, const disti_ray *ray, dist_stats *stats)
+{
+    stats->rays++;
+    stats->rays_in_sphere += ray->enter < ray->leave;
+    stats->hits += (unsigned)disti_ray_is_hit(tracer, ray);
+    stats->unresolved += ray->status == DIST_RAY_UNRESOLVED;
+    stats->inside += ray->status == DIST_RAY_INSIDE;
+    stats->plateau += ray->status == DIST_RAY_PLATEAU;
+    stats->not_finite += ray->status == DIST_RAY_NOT_FINITE;
+    if (ray->status != DIST_RAY_HIT) return;
+    float epsilon = disti_ray_epsilon(tracer, ray, ray->best);
+    stats->error = DISTI_MAX(stats->error, ray->error);
+    stats->epsilon = stats->epsilon > 0.0f ? DISTI_MIN(stats->epsilon, epsilon) : epsilon;
+}
+
+typedef struct disti_free_job {
+    const disti_tracer *tracer;
+    size_t n;
+    const float *origins, *directions;
+    dist_hit *hits;
+} disti_free_job;
+
+enum { DISTI_FREE_RAYS = 1024 };
+
+static void disti_free_task(void *arg, int index, int worker)
+{
+    const disti_free_job *job = (const disti_free_job *)arg;
+    disti_bench bench;
+    disti_bench_init(job->tracer->ctx, worker, &bench);
+    size_t first = (size_t)index * DISTI_FREE_RAYS;
+    size_t n = DISTI_MIN((size_t)DISTI_FREE_RAYS, job->n - first);
+    for (size_t i = 0; i < n; i++) {
+        double o[3], d[3];
+        for (size_t k = 0; k < 3; k++) {
+            o[k] = (double)job->origins[3 * (first + i) + k];
+            d[k] = (double)job->directions[3 * (first + i) + k];
+        }
+        int good = disti_finite_all(3, job->origins + 3 * (first + i)) && disti_finite_all(3, job->directions + 3 * (first + i)) &&
+                   disti_normalize(d);
+        if (!good) o[0] = o[1] = o[2] = d[0] = d[1] = d[2] = 0.0;
+        disti_ray_init(job->tracer->field, o, d, 0.0, &bench.rays[i]);
+        if (!good) disti_ray_end(&bench.rays[i], DIST_RAY_NOT_FINITE, 0.0f, 0.0f, 0.0f);
+    }
+    disti_trace_rounds(job->tracer, worker, &bench, n);
+    for (size_t i = 0; i < n; i++) {
+        const disti_ray *ray = &bench.rays[i];
+        dist_hit *hit = job->hits + first + i;
+        disti_stats_ray(job->tracer, ray, bench.stats);
+        hit->distance = (float)(ray->base + (double)ray->best);
+        hit->error = ray->error;
+        hit->sdf = ray->fbest;
+        hit->status = ray->status;
+    }
+}
+
+DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size_t n, const float *origins, const float *directions,
+                                const dist_render_desc *how, dist_hit *hits, dist_stats *stats)
+{
+    disti_tracer tracer;
+    disti_free_job job;
+    dist_status status = disti_enter(ctx, "dist_trace");
+    if (status == DIST_OK) status = disti_field_check(ctx, field, "dist_trace");
+    if (status == DIST_OK) status = disti_tracer_init(&tracer, ctx, field, how, "dist_trace");
+    if (status != DIST_OK) return status;
+    if (n > 0 && (!origins || !directions || !hits))
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_trace: origins, directions or hits is NULL", NULL, 0, 0);
+    if (n > (size_t)1 << 40) return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_trace: n is %d, at most 2^40", NULL, (double)n, 0);
+    disti_stats_begin(ctx);
+    job.tracer = &tracer;
+    job.n = n;
+    job.origins = origins;
+    job.directions = directions;
+    job.hits = hits;
+    disti_run(ctx, (int)((n + DISTI_FREE_RAYS - 1) / DISTI_FREE_RAYS), disti_free_task, &job);
+    disti_stats_end(ctx, &tracer, stats);
+    return DIST_OK;
+}
+
+/* Cones: a block of pixels marches as one while the sphere that f / L proves empty is wider than the block's cone there; then
+   its children start where it stopped. Safe for anything, however thin, under the Lipschitz bound: every point of every ray of
+   the block before the stop lies in one of the empty spheres. */
+typedef struct disti_cone {
+    disti_ray axis;
+    double enter, leave; /* along any of the block's rays, measured from the camera */
+    double t;
+    double chord, cosine, sine; /* of the cone's half angle: chord = 2 sin(angle / 2) */
+    int x, y;     /* first pixel, within the tile */
+    int size;
+    int blocked;
+} disti_cone;
+
+/* The tile as the cones see it. */
+typedef struct disti_tile {
+    const disti_view *view;
+    int x, y, width, height; /* in the picture; width and height at most DISTI_TILE */
+} disti_tile;
+
+static void disti_cone_init(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench, disti_cone *cone)
+{
+    int x1 = DISTI_MIN(cone->x + cone->size, tile->width) - 1, y1 = DISTI_MIN(cone->y + cone->size, tile->height) - 1;
+    double axis[3], corner[3], world[3], widest = 0.0;
+    disti_view_direction(tile->view, tile->x + 0.5 * (cone->x + x1), tile->y + 0.5 * (cone->y + y1), axis);
+    for (int i = 0; i < 4; i++) {
+        disti_view_direction(tile->view, tile->x + (i & 1 ? x1 : cone->x), tile->y + (i & 2 ? y1 : cone->y), corner);
+        double d[3] = {corner[0] - axis[0], corner[1] - axis[1], corner[2] - axis[2]};
+        widest = DISTI_MAX(widest, sqrt(disti_dot(d, d)));
+    }
+    cone->chord = widest;
+    cone->cosine = 1.0 - 0.5 * widest * widest; /* chord = 2 sin(angle / 2), so cos(angle) = 1 - chord^2 / 2 */
+    cone->sine = widest * sqrt(DISTI_MAX(0.0, 1.0 - 0.25 * widest * widest));
+    disti_rotate_back(tile->view->rotation, axis, world);
+    disti_ray_init(tracer->field, tile->view->center, world, 0.0, &cone->axis);
+    cone->enter = 1e300;
+    cone->leave = -1e300;
+    for (int y = cone->y; y <= y1; y++) {
+        for (int x = cone->x; x <= x1; x++) {
+            const disti_ray *ray = &bench->rays[y * tile->width + x];
+            if (ray->mode == DISTI_DONE) continue;
+            cone->enter = DISTI_MIN(cone->enter, ray->base + (double)ray->enter);
+            cone->leave = DISTI_MAX(cone->leave, ray->base + (double)ray->leave);
+        }
+    }
+    cone->t = DISTI_MAX(cone->t, cone->enter);
+}
+
+/* One sample at the cone's axis. 1: it goes on; 0: it is blocked or through. */
+static int disti_cone_advance(const disti_tracer *tracer, disti_cone *cone, float f)
+{
+    cone->blocked = 1;
+    if (!disti_finite(f)) return 0;
+    double radius = ((double)f - (double)(tracer->epsilon > 0.0f ? tracer->epsilon : 5e-5f * tracer->field->radius)) / (double)tracer->lipschitz;
+    double wide = cone->t * cone->sine;
+    if (radius < 1.05 * cone->t * cone->chord || radius <= wide) return 0;
+    double t = cone->t * cone->cosine + sqrt(radius * radius - wide * wide);
+    if (t - cone->t < 1e-3 * (double)tracer->field->radius) return 0;
+    cone->t = t;
+    cone->blocked = t < cone->leave;
+    return cone->blocked;
+}
+
+/* What the cones leave: rays of a block that is through are misses; the others start at the block's stop. */
+static void disti_cone_finish(const disti_tile *tile, const disti_bench *bench, const disti_cone *cone)
+{
+    for (int y = cone->y; y < DISTI_MIN(cone->y + cone->size, tile->height); y++) {
+        for (int x = cone->x; x < DISTI_MIN(cone->x + cone->size, tile->width); x++) {
+            disti_ray *ray = &bench->rays[y * tile->width + x];
+            if (ray->mode == DISTI_DONE) continue;
+            if (!cone->blocked || cone->t >= ray->base + (double)ray->leave) {
+                ray->mode = DISTI_DONE;
+                ray->status = DIST_RAY_MISS;
+            } else {
+                ray->q = DISTI_MAX(ray->enter, (float)(cone->t - ray->base));
+            }
+        }
+    }
+}
+
+enum { DISTI_CONE_FIRST = 32, DISTI_CONE_LEAF = 4, DISTI_CONES_MOST = (DISTI_TILE / DISTI_CONE_LEAF) * (DISTI_TILE / DISTI_CONE_LEAF) };
+
+/* Marches one level's cones to their stops, all of them in packed rounds. */
+static void disti_cone_rounds(const disti_tracer *tracer, int worker, const disti_bench *bench, disti_cone *cones, int count)
+{
+    size_t active = 0;
+    for (int i = 0; i < count; i++) {
+        cones[i].blocked = 0;
+        if (cones[i].enter <= cones[i].leave && cones[i].t < cones[i].leave) bench->index[active++] = i;
+    }
+    for (int round = 0; active > 0; round++) {
+        size_t kept = 0;
+        for (size_t i = 0; i < active; i++) {
+            const disti_cone *cone = &cones[bench->index[i]];
+            disti_ray_point(&cone->axis, (float)(cone->t - cone->axis.base), bench->points + 3 * i);
+        }
+        tracer->field->eval_fn(tracer->field->user, worker, active, bench->points, bench->sdf, NULL);
+        bench->stats->queries += active;
+        bench->stats->cone_queries += active;
+        for (size_t i = 0; i < active; i++)
+            if (disti_cone_advance(tracer, &cones[bench->index[i]], bench->sdf[i]) && round < 64) bench->index[kept++] = bench->index[i];
+        active = kept;
+    }
+}
+
+/* Blocks of 32, 16, 8, 4 pixels. The two cone lists stand in bench->rest. */
+static void disti_cones(const disti_tracer *tracer, int worker, const disti_tile *tile, const disti_bench *bench)
+{
+    disti_cone *cones = (disti_cone *)(void *)bench->rest;
+    disti_cone *next = cones + DISTI_CONES_MOST;
+    int count = 0;
+    memset(cones, 0, sizeof(disti_cone) * 4);
+    for (int y = 0; y < tile->height; y += DISTI_CONE_FIRST) {
+        for (int x = 0; x < tile->width; x += DISTI_CONE_FIRST) {
+            cones[count].x = x;
+            cones[count].y = y;
+            cones[count++].size = DISTI_CONE_FIRST;
+        }
+    }
+    for (int size = DISTI_CONE_FIRST;; size /= 2) {
+        int children = 0;
+        for (int i = 0; i < count; i++) disti_cone_init(tracer, tile, bench, &cones[i]);
+        disti_cone_rounds(tracer, worker, bench, cones, count);
+        for (int i = 0; i < count; i++) {
+            if (!cones[i].blocked || size == DISTI_CONE_LEAF) {
+                disti_cone_finish(tile, bench, &cones[i]);
+                continue;
+            }
+            for (int k = 0; k < 4; k++) {
+                disti_cone *child = &next[children];
+                memset(child, 0, sizeof *child);
+                child->size = size / 2;
+                child->x = cones[i].x + (k & 1 ? child->size : 0);
+                child->y = cones[i].y + (k & 2 ? child->size : 0);
+                child->t = cones[i].t;
+                children += child->x < tile->width && child->y < tile->height;
+            }
+        }
+        if (size == DISTI_CONE_LEAF || children == 0) return;
+        disti_cone *swap = cones;
+        cones = next;
+        next = swap;
+        count = children;
+    }
+}
+
+/* Soft silhouette of the rays that miss: min |f| along each. Cones and stretched steps leave no sample near the minimum, so it
+   is looked for: one ray of each 4 x 4 block that has no sample samples its whole length; its neighbors start at the
+   distance found there; then every ray fits a parabola through three samples around its best one. A value off by ds costs
+   ds^2 / 2 times the curvature: first-order exact                                                  (envelope theorem) */
+static int disti_wants_minimum(const disti_ray *ray)
+{
+    return ray->status == DIST_RAY_MISS && ray->enter < ray->leave;
+}
+
+static void disti_keep_least(disti_ray *ray, float s, float f)
+{
+    float a = f < 0.0f ? -f : f, b = ray->fbest < 0.0f ? -ray->fbest : ray->fbest;
+    if (!disti_finite(f) || a >= b) return;
+    ray->best = s;
+    ray->fbest = f;
+}
+
+/* Evaluates `count` points of bench->points for the silhouette. */
+static void disti_silhouette_eval(const disti_tracer *tracer, int worker, const disti_bench *bench, size_t count)
+{
+    if (count == 0) return;
+    tracer->field->eval_fn(tracer->field->user, worker, count, bench->points, bench->sdf, NULL);
+    bench->stats->queries += count;
+    bench->stats->silhouette_queries += count;
+}
+
+/* s of the least of the parabola through (-h, left), (0, middle), (h, right), within (-h, h). */
+static float disti_parabola(float h, float left, float middle, float right)
+{
+    float curvature = left - 2.0f * middle + right;
+    if (!(curvature > 0.0f)) return left < right ? -0.5f * h : 0.5f * h;
+    float s = 0.5f * h * (left - right) / curvature;
+    return s > h ? h : s < -h ? -h : s;
+}
+
+enum { DISTI_PROBES = 8 };
+
+/* For each 4 x 4 block whose missing rays have no sample: probe one ray; leaves the distance from the camera in t[block]. */
+static void disti_silhouette_probe(const disti_tracer *tracer, int worker, const disti_tile *tile, const disti_bench *bench, double *t)
+{
+    int across = (tile->width + 3) / 4, blocks = across * ((tile->height + 3) / 4);
+    size_t probes = 0;
+    for (int block = 0; block < blocks; block++) {
+        int found = -1;
+        for (int k = 0; k < 16 && found < 0; k++) {
+            int x = block % across * 4 + (k + 5) % 16 % 4, y = block / across * 4 + (k + 5) % 16 / 4;
+            if (x >= tile->width || y >= tile->height) continue;
+            const disti_ray *ray = &bench->rays[y * tile->width + x];
+            if (disti_wants_minimum(ray) && ray->fbest > 2e38f) found = y * tile->width + x;
+        }
+        t[block] = -1.0;
+        if (found < 0) continue;
+        disti_ray *ray = &bench->rays[found];
+        for (int k = 0; k < DISTI_PROBES; k++)
+            disti_ray_point(ray, ray->enter + (ray->leave - ray->enter) * ((float)k + 0.5f) / (float)DISTI_PROBES,
+                            bench->points + 3 * (probes * DISTI_PROBES + (size_t)k));
+        bench->index[2 * probes] = found;
+        bench->index[2 * probes + 1] = block;
+        probes++;
+    }
+    disti_silhouette_eval(tracer, worker, bench, probes * DISTI_PROBES);
+    for (size_t i = 0; i < probes; i++) {
+        disti_ray *ray = &bench->rays[bench->index[2 * i]];
+        const float *f = bench->sdf + i * DISTI_PROBES;
+        float h = (ray->leave - ray->enter) / (float)DISTI_PROBES;
+        int least = 0;
+        for (int k = 1; k < DISTI_PROBES; k++) least = f[k] < f[least] ? k : least;
+        float s = ray->enter + h * ((float)least + 0.5f);
+        disti_keep_least(ray, s, f[least]);
+        if (least > 0 && least + 1 < DISTI_PROBES) s += disti_parabola(h, f[least - 1], f[least], f[least + 1]);
+        t[bench->index[2 * i + 1]] = ray->base + (double)s;
+    }
+}
+
+static void disti_silhouette(const disti_tracer *tracer, int worker, const disti_tile *tile, const disti_bench *bench)
+{
+    double *t = (double *)(void *)bench->rest;
+    int n = tile->width * tile->height, across = (tile->width + 3) / 4;
+    float far = tracer->field->clamp > 0.0f ? 0.98f * tracer->field->clamp : 0.2f * tracer->field->radius;
+    size_t count = 0;
+    disti_silhouette_probe(tracer, worker, tile, bench, t);
+    for (int i = 0; i < n; i++) {
+        disti_ray *ray = &bench->rays[i];
+        double start = t[i / tile->width / 4 * across + i % tile->width / 4];
+        if (!disti_wants_minimum(ray) || start < 0.0 || ray->fbest < far) continue;
+        float s = (float)(start - ray->base);
+        ray->q = DISTI_MIN(DISTI_MAX(s, ray->enter), ray->leave);
+        disti_ray_point(ray, ray->q, bench->points + 3 * count);
+        bench->index[count++] = i;
+    }
+    disti_silhouette_eval(tracer, worker, bench, count);
+    for (size_t k = 0; k < count; k++) disti_keep_least(&bench->rays[bench->index[k]], bench->rays[bench->index[k]].q, bench->sdf[k]);
+    for (int round = 0; round < 3; round++) { /* left, right, and where the parabola is least */
+        count = 0;
+        for (int i = 0; i < n; i++) {
+            disti_ray *ray = &bench->rays[i];
+            if (!disti_wants_minimum(ray) || !(ray->width > 0.0f || round == 0)) continue;
+            if (round == 0) { /* a: the best sample as it stood; width: the parabola's half width, 0 for far rays */
+                float magnitude = ray->fbest < 0.0f ? -ray->fbest : ray->fbest;
+                ray->width = magnitude < far ? DISTI_MAX(0.5f * magnitude, 2e-3f * tracer->field->radius) : 0.0f;
+                ray->a = ray->best;
+                ray->fa = ray->fbest;
+                if (!(ray->width > 0.0f)) continue;
+            }
+            float ds = round == 0 ? -ray->width : round == 1 ? ray->width : disti_parabola(ray->width, ray->b, ray->fa, ray->fb);
+            ray->q = DISTI_MIN(DISTI_MAX(ray->a + ds, ray->enter), ray->leave);
+            disti_ray_point(ray, ray->q, bench->points + 3 * count);
+            bench->index[count++] = i;
+        }
+        disti_silhouette_eval(tracer, worker, bench, count);
+        for (size_t k = 0; k < count; k++) {
+            disti_ray *ray = &bench->rays[bench->index[k]];
+            if (round == 0) ray->b = bench->sdf[k];
+            if (round == 1) ray->fb = bench->sdf[k];
+            disti_keep_least(ray, ray->q, bench->sdf[k]);
+        }
+    }
+}
+
+#ifndef DIST_NO_PAPER
+/* The paper's tracer as its authors' code runs it, so that Table 1 can be measured row by row and gradients compared:
+     t <- t + alpha clamp(f, 0.1)   from the unit sphere on;   the sample of smallest |f| of the whole ray gives the distance,
+     t_k + clamp(f_k);   hit: t before the exit and smallest |f| <= epsilon and, without coarse-to-fine, first f > epsilon.
+   Coarse-to-fine starts with a ray for each 4 x 4, then 2 x 2 pixels, three steps each; children go on at their parent's
+   distance and inherit its samples, although those do not lie on the child's ray. 0.1 is 0.1 radii here. */
+typedef struct disti_paper_ray {
+    disti_ray ray;
+    float samples[8 * 4]; /* f and point of the K samples of smallest |f|, ascending */
+} disti_paper_ray;
+
+static void disti_paper_keep(float *samples, int count, float f, const float *p)
+{
+    float magnitude = f < 0.0f ? -f : f;
+    int at = count;
+    while (at > 0) {
+        float other = samples[4 * (at - 1)];
+        if ((other < 0.0f ? -other : other) <= magnitude) break;
+        if (at < count) memcpy(samples + 4 * at, samples + 4 * (at - 1), 4 * sizeof(float));
+        at--;
+    }
+    if (at == count) return;
+    samples[4 * at] = f;
+    memcpy(samples + 4 * at + 1, p, 3 * sizeof(float));
+}
+
+static void disti_paper_clear(float *samples, int count)
+{
+    memset(samples, 0, (size_t)count * 4 * sizeof(float));
+    for (int k = 0; k < count; k++) samples[4 * k] = 3e38f;
+}
+
+static float disti_clamp(float f, float limit)
+{
+    return f > limit ? limit : f < -limit ? -limit : f;
+}
+
+/* One query's worth of marching. ray->s: t; f: last f; a: first f of the finest level; fa: smallest |f| there. */
+static void disti_paper_step(const disti_tracer *tracer, disti_ray *ray, float *samples, float alpha, float f, const float *p)
+{
+    float magnitude = f < 0.0f ? -f : f;
+    disti_keep_least(ray, ray->s, f);
+    if (samples) disti_paper_keep(samples, tracer->how.samples, f, p);
+    if (ray->steps == 0) ray->a = f;
+    if (ray->steps == 0 || magnitude < ray->fa) ray->fa = magnitude;
+    ray->f = f;
+    ray->s += alpha * disti_clamp(f, 0.1f * tracer->field->radius);
+    ray->steps++;
+}
+
+/* `steps` unconditional steps of coarse rays. */
+static void disti_paper_coarse(const disti_tracer *tracer, int worker, const disti_bench *bench, disti_paper_ray *rays, size_t n, int steps)
+{
+    for (int step = 0; step < steps; step++) {
+        size_t count = 0;
+        for (size_t i = 0; i < n; i++) {
+            if (rays[i].ray.mode == DISTI_DONE) continue;
+            disti_ray_point(&rays[i].ray, rays[i].ray.s, bench->points + 3 * count);
+            bench->index[count++] = (int)i;
+        }
+        if (count == 0) return;
+        tracer->field->eval_fn(tracer->field->user, worker, count, bench->points, bench->sdf, NULL);
+        bench->stats->queries += count;
+        bench->stats->cone_queries += count;
+        for (size_t k = 0; k < count; k++) {
+            disti_paper_ray *r = &rays[bench->index[k]];
+            disti_paper_step(tracer, &r->ray, r->samples, tracer->how.step_scale, bench->sdf[k], bench->points + 3 * k);
+        }
+    }
+}
+
+/* Child goes on where the parent is: same distance along the ray, the parent's samples. */
+static void disti_paper_inherit(const disti_tracer *tracer, const disti_paper_ray *parent, disti_ray *ray, float *samples)
+{
+    ray->s = (float)(parent->ray.base + (double)parent->ray.s - ray->base);
+    ray->best = (float)(parent->ray.base + (double)parent->ray.best - ray->base);
+    ray->fbest = parent->ray.fbest;
+    ray->steps = 0;
+    if (samples) memcpy(samples, parent->samples, (size_t)tracer->how.samples * 4 * sizeof(float));
+}
+
+/* Coarse rays of one level: blocks of `scale` pixels, centers at s g + (s - 1) / 2; alive where a pixel under them meets the
+   sphere. A coarse ray that itself misses it starts at the sphere's tangent length. */
+static size_t disti_paper_level(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench, int scale, disti_paper_ray *rays)
+{
+    int across = (tile->width + scale - 1) / scale, down = (tile->height + scale - 1) / scale;
+    for (int g = 0; g < across * down; g++) {
+        int x0 = g % across * scale, y0 = g / across * scale, alive = 0;
+        double direction[3], world[3];
+        disti_paper_ray *r = &rays[g];
+        disti_view_direction(tile->view, tile->x + x0 + 0.5 * (scale - 1), tile->y + y0 + 0.5 * (scale - 1), direction);
+        disti_rotate_back(tile->view->rotation, direction, world);
+        disti_ray_init(tracer->field, tile->view->center, world, 0.0, &r->ray);
+        disti_paper_clear(r->samples, tracer->how.samples);
+        for (int y = y0; y < DISTI_MIN(y0 + scale, tile->height); y++)
+            for (int x = x0; x < DISTI_MIN(x0 + scale, tile->width); x++) alive |= bench->rays[y * tile->width + x].mode != DISTI_DONE;
+        if (alive && r->ray.mode == DISTI_DONE) r->ray.s = 0.0f; /* the closest approach */
+        r->ray.mode = alive ? DISTI_MARCH : DISTI_DONE;
+    }
+    return (size_t)(across * down);
+}
+
+static void disti_paper_finish(const disti_tracer *tracer, disti_ray *ray)
+{
+    float epsilon = tracer->epsilon;
+    int first = tracer->how.paper_row == DIST_PAPER_COARSE_TO_FINE || ray->a > epsilon;
+    int before = ray->s < ray->leave;
+    float f = ray->fbest, magnitude = f < 0.0f ? -f : f;
+    ray->mode = DISTI_DONE;
+    ray->status = DIST_RAY_MISS;
+    if (!disti_finite(ray->f)) ray->status = DIST_RAY_NOT_FINITE;
+    else if (before && ray->fa <= epsilon && first) ray->status = DIST_RAY_HIT;
+    else if (before && !first && ray->a < 0.0f) ray->status = DIST_RAY_INSIDE;
+    else if (before) ray->status = DIST_RAY_UNRESOLVED;
+    ray->error = magnitude;
+    ray->q = ray->best; /* where the smallest |f| was met */
+    if (ray->status == DIST_RAY_HIT) ray->best += disti_clamp(f, 0.1f * tracer->field->radius);
+}
+
+/* Traces one tile. samples (rays, how.samples, 4) may be NULL; it is written for every ray. */
+static void disti_paper_trace(const disti_tracer *tracer, int worker, const disti_tile *tile, const disti_bench *bench, float *samples,
+                              size_t samples_stride)
+{
+    size_t n = (size_t)(tile->width * tile->height), kept = (size_t)tracer->how.samples * 4;
+    int row = tracer->how.paper_row, steps = tracer->how.max_steps;
+    int pyramid = row == DIST_PAPER_COARSE_TO_FINE;
+    float alpha = pyramid || row == DIST_PAPER_AGGRESSIVE ? tracer->how.step_scale : 1.0f;
+    disti_paper_ray *quarter = (disti_paper_ray *)(void *)bench->rest, *half = quarter + 64;
+    int across4 = (tile->width + 3) / 4, across2 = (tile->width + 1) / 2;
+    if (pyramid) {
+        size_t count = disti_paper_level(tracer, tile, bench, 4, quarter);
+        disti_paper_coarse(tracer, worker, bench, quarter, count, 3);
+        count = disti_paper_level(tracer, tile, bench, 2, half);
+        for (size_t g = 0; g < count; g++)
+            disti_paper_inherit(tracer, &quarter[(int)g / across2 / 2 * across4 + (int)g % across2 / 2], &half[g].ray, half[g].samples);
+        disti_paper_coarse(tracer, worker, bench, half, count, 3);
+        steps = DISTI_MAX(steps - 6, 1);
+    }
+    for (size_t i = 0; i < n; i++) {
+        size_t x = i % (size_t)tile->width, y = i / (size_t)tile->width;
+        float *mine = samples ? samples + y * samples_stride * kept + x * kept : NULL;
+        disti_ray *ray = &bench->rays[i];
+        if (mine) disti_paper_clear(mine, tracer->how.samples);
+        if (ray->mode != DISTI_DONE && pyramid) disti_paper_inherit(tracer, &half[y / 2 * (size_t)across2 + x / 2], ray, mine);
+    }
+    for (int step = 0; step < steps; step++) {
+        size_t count = 0;
+        for (size_t i = 0; i < n; i++) {
+            disti_ray *ray = &bench->rays[i];
+            float magnitude = ray->f < 0.0f ? -ray->f : ray->f;
+            if (ray->mode == DISTI_DONE) continue;
+            if (row != DIST_PAPER_PARALLEL && step > 0 && !(ray->s < ray->leave && magnitude >= tracer->epsilon)) continue;
+            disti_ray_point(ray, ray->s, bench->points + 3 * count);
+            bench->index[count++] = (int)i;
+        }
+        if (count == 0) break;
+        tracer->field->eval_fn(tracer->field->user, worker, count, bench->points, bench->sdf, NULL);
+        bench->stats->queries += count;
+        bench->stats->march_queries += count;
+        for (size_t k = 0; k < count; k++) {
+            size_t i = (size_t)bench->index[k], x = i % (size_t)tile->width, y = i / (size_t)tile->width;
+            float *mine = samples ? samples + y * samples_stride * kept + x * kept : NULL;
+            disti_paper_step(tracer, &bench->rays[i], mine, alpha, bench->sdf[k], bench->points + 3 * k);
+        }
+    }
+    for (size_t i = 0; i < n; i++)
+        if (bench->rays[i].mode != DISTI_DONE) disti_paper_finish(tracer, &bench->rays[i]);
+}
+#endif
+
+/*@ 08 render -------------------------------------------------------------------------------------------------------------- */
+
+enum { DISTI_CHUNK = DISTI_SLOTS * 4 * DISTI_BLOCK }; /* points of the backward pass held at once */
+
+/* One point of the backward pass. */
+typedef struct disti_entry {
+    float d_distance;   /* dL/d(distance along the ray), field units */
+    float d_sdf;        /* dL/df at this point from elsewhere: silhouette, normal's differences, the paper's samples */
+    float direction[3]; /* of the ray, field space */
+    unsigned pixel;
+    unsigned char capped;
+} disti_entry;
+
+/* distance and status: written by dist_render, read by the backward pass. samples: the paper's K (f and point), likewise.
+   The rest is the backward pass's work space. */
+struct dist_tape {
+    dist_context *ctx;
+    int width, height, trace, samples;
+    float *s;               /* (pixels): hit, or sample of smallest |f|, measured from the closest approach to the center */
+    unsigned char *status;  /* (pixels): DIST_RAY_*, with DISTI_TAPE_* bits */
+    float *sample;          /* (pixels, samples, 4), paper's tracer only */
+    int rendered, has_silhouette;
+    dist_field field;
+    dist_camera camera;
+    disti_tracer tracer;
+    disti_entry *entry;     /* DISTI_CHUNK */
+    float *points, *d_sdf, *d_points; /* (DISTI_CHUNK, 3), 1, 3 */
+    double *d_code;
+};
+
+enum { DISTI_TAPE_HIT = 16, DISTI_TAPE_SAMPLE = 32 }; /* counts as a hit; has a sample of smallest |f| */
+
+static size_t disti_tape_bytes(const dist_tape *tape, int part)
+{
+    size_t pixels = (size_t)tape->width * (size_t)tape->height; /* at most 2^32: fits where size_t has 32 bits after the check */
+    size_t bytes = (size_t)-1;
+    int good = (size_t)tape->height <= (size_t)-1 / (size_t)tape->width;
+    switch (part) {
+    case 0: good = good && disti_size_mul(pixels, sizeof(float), &bytes); break;
+    case 1: bytes = pixels; break;
+    case 2:
+        good = good && disti_size_mul(pixels, tape->trace == DIST_TRACE_PAPER ? (size_t)tape->samples * 4 * sizeof(float) : 0, &bytes);
+        break;
+    case 3: bytes = DISTI_CHUNK * sizeof(disti_entry); break;
+    case 4: bytes = DISTI_CHUNK * 7 * sizeof(float); break;
+    }
+    return good ? bytes : (size_t)-1;
+}
+
+DIST_API void dist_tape_destroy(dist_tape *tape)
+{
+    if (!tape) return;
+    disti_free(tape->ctx, tape->points, disti_tape_bytes(tape, 4));
+    disti_free(tape->ctx, tape->entry, disti_tape_bytes(tape, 3));
+    if (tape->sample) disti_free(tape->ctx, tape->sample, disti_tape_bytes(tape, 2));
+    disti_free(tape->ctx, tape->status, disti_tape_bytes(tape, 1));
+    disti_free(tape->ctx, tape->s, disti_tape_bytes(tape, 0));
+    disti_free(tape->ctx, tape, sizeof *tape);
+}
+
+DIST_API dist_tape *dist_tape_create(dist_context *ctx, const dist_camera *camera, const dist_render_desc *desc)
+{
+    const char *name = "dist_tape_create";
+    dist_render_desc raw;
+    if (disti_enter(ctx, name) != DIST_OK || disti_camera_check(ctx, camera, name) != DIST_OK) return NULL;
+    memset(&raw, 0, sizeof raw);
+    if (desc) raw = *desc;
+    if (disti_how_check(ctx, &raw, name) != DIST_OK) return NULL;
+    if (disti_partial_reserve(ctx, 1024) != DIST_OK) return NULL; /* for codes of fields that are not nets */
+    dist_tape *tape = (dist_tape *)disti_alloc(ctx, sizeof(dist_tape));
+    if (!tape) return NULL;
+    memset(tape, 0, sizeof *tape);
+    raw = dist_render_desc_resolve(desc);
+    tape->ctx = ctx;
+    tape->width = camera->width;
+    tape->height = camera->height;
+    tape->trace = raw.trace;
+    tape->samples = raw.samples;
+    tape->s = (float *)disti_alloc(ctx, disti_tape_bytes(tape, 0));
+    tape->status = tape->s ? (unsigned char *)disti_alloc(ctx, disti_tape_bytes(tape, 1)) : NULL;
+    if (tape->status && raw.trace == DIST_TRACE_PAPER) tape->sample = (float *)disti_alloc(ctx, disti_tape_bytes(tape, 2));
+    tape->entry = tape->status ? (disti_entry *)disti_alloc(ctx, disti_tape_bytes(tape, 3)) : NULL;
+    tape->points = tape->entry ? (float *)disti_alloc(ctx, disti_tape_bytes(tape, 4)) : NULL;
+    if (!tape->points || (raw.trace == DIST_TRACE_PAPER && !tape->sample)) {
+        dist_tape_destroy(tape);
+        return NULL;
+    }
+    tape->d_sdf = tape->points + 3 * (size_t)DISTI_CHUNK;
+    tape->d_points = tape->d_sdf + DISTI_CHUNK;
+    return tape;
+}
+
+/* Half a pixel's width at unit distance: cos^2 / (2 f), with the larger of the focal lengths. */
+static double disti_view_footprint(const disti_view *view, double cosine)
+{
+    double f = DISTI_MAX(fabs(view->fx), fabs(view->fy));
+    return 0.5 * cosine * cosine / f;
+}
+
+/* Ray of pixel (x, y), unit direction in camera space in `local`. */
+static void disti_pixel_ray(const disti_view *view, const dist_field *field, int x, int y, double local[3], disti_ray *ray)
+{
+    double world[3];
+    disti_view_direction(view, x, y, local);
+    disti_rotate_back(view->rotation, local, world);
+    disti_ray_init(field, view->center, world, disti_view_footprint(view, local[2]), ray);
+}
+
+typedef struct disti_render_job {
+    const disti_tracer *tracer;
+    const disti_view *view;
+    const dist_images *out;
+    dist_tape *tape;
+    int tile, across;
+} disti_render_job;
+
+/* Gradients of f at up to DISTI_GRADIENTS hit points at a time. */
+enum { DISTI_GRADIENTS = 1024 };
+
+/* normal    analytic: grad f / |grad f|;  difference: the same of G_i = (f(p + delta e_i) - f(p - delta e_i)) / (2 delta)
+   Writes G for n points; the analytic one in one pass, differences in six queries a point. G = 0 where it is not finite. */
+static void disti_normal_gradient(const disti_tracer *tracer, int worker, const disti_bench *bench, size_t n, const float *points, float *gradient)
+{
+    const dist_field *field = tracer->field;
+    if (tracer->how.normal_mode == DIST_NORMAL_ANALYTIC) {
+        field->eval_fn(field->user, worker, n, points, bench->sdf, gradient);
+        bench->stats->normal_queries += n;
+        bench->stats->queries += n;
+    } else {
+        float delta = tracer->how.normal_delta;
+        memset(gradient, 0, 3 * n * sizeof(float));
+        for (int side = 0; side < 6; side++) {
+            float shift = side & 1 ? -delta : delta, *moved = bench->points;
+            memcpy(moved, points, 3 * n * sizeof(float));
+            for (size_t i = 0; i < n; i++) moved[3 * i + (size_t)(side / 2)] += shift;
+            field->eval_fn(field->user, worker, n, moved, bench->sdf, NULL);
+            for (size_t i = 0; i < n; i++) gradient[3 * i + (size_t)(side / 2)] += bench->sdf[i] / (2.0f * shift);
+        }
+        bench->stats->normal_queries += 6 * n;
+        bench->stats->queries += 6 * n;
+    }
+    for (size_t i = 0; i < n; i++)
+        if (!disti_finite_all(3, gradient + 3 * i)) gradient[3 * i] = gradient[3 * i + 1] = gradient[3 * i + 2] = 0.0f;
+}
+
+static void disti_render_normals(const disti_render_job *job, int worker, const disti_tile *tile, const disti_bench *bench)
+{
+    const disti_tracer *tracer = job->tracer;
+    float *points = (float *)(void *)bench->rest, *gradient = points + 3 * DISTI_GRADIENTS;
+    int n = tile->width * tile->height;
+    for (int i = 0; i < n;) {
+        size_t count = 0;
+        for (; i < n && count < DISTI_GRADIENTS; i++) {
+            if (!disti_ray_is_hit(tracer, &bench->rays[i])) continue;
+            disti_ray_point(&bench->rays[i], bench->rays[i].best, points + 3 * count);
+            bench->index[count++] = i;
+        }
+        if (count == 0) break;
+        disti_normal_gradient(tracer, worker, bench, count, points, gradient);
+        for (size_t k = 0; k < count; k++) {
+            double g[3] = {(double)gradient[3 * k], (double)gradient[3 * k + 1], (double)gradient[3 * k + 2]}, normal[3];
+            if (!disti_normalize(g)) continue;
+            if (tracer->how.normal_space == DIST_SPACE_WORLD) memcpy(normal, g, sizeof normal);
+            else disti_rotate(tile->view->rotation, g, normal);
+            size_t pixel = (size_t)(tile->y + bench->index[k] / tile->width) * (size_t)tile->view->width +
+                           (size_t)(tile->x + bench->index[k] % tile->width);
+            for (size_t axis = 0; axis < 3; axis++) job->out->normal[3 * pixel + axis] = (float)normal[axis];
+        }
+    }
+}
+
+static void disti_render_colors(const disti_render_job *job, int worker, const disti_tile *tile, const disti_bench *bench)
+{
+    const dist_field *field = job->tracer->field;
+    float *points = (float *)(void *)bench->rest, *color = points + 3 * DISTI_GRADIENTS;
+    int n = tile->width * tile->height;
+    for (int i = 0; i < n;) {
+        size_t count = 0;
+        for (; i < n && count < DISTI_GRADIENTS; i++) {
+            if (!disti_ray_is_hit(job->tracer, &bench->rays[i])) continue;
+            disti_ray_point(&bench->rays[i], bench->rays[i].best, points + 3 * count);
+            bench->index[count++] = i;
+        }
+        if (count == 0) break;
+        field->color_fn(field->user, worker, count, points, color);
+        bench->stats->queries += count;
+        for (size_t k = 0; k < count; k++) {
+            size_t pixel = (size_t)(tile->y + bench->index[k] / tile->width) * (size_t)tile->view->width +
+                           (size_t)(tile->x + bench->index[k] % tile->width);
+            memcpy(job->out->color + 3 * pixel, color + 3 * k, 3 * sizeof(float));
+        }
+    }
+}
+
+/* Value of the soft silhouette of a finished ray: signed f at a hit, |f| at a miss, less epsilon; off the sphere the line's
+   distance to it. The sign says hit or miss whatever rounding did. */
+static float disti_ray_silhouette(const disti_tracer *tracer, const disti_ray *ray)
+{
+    const dist_field *field = tracer->field;
+    float tiny = 1e-3f * tracer->noise;
+    if (ray->enter >= ray->leave) {
+        float d = disti_length(ray->origin[0] - field->center[0], ray->origin[1] - field->center[1], ray->origin[2] - field->center[2]);
+        return DISTI_MAX(d - field->radius, tiny);
+    }
+    float f = ray->fbest, magnitude = f < 0.0f ? -f : f;
+    float epsilon = disti_ray_epsilon(tracer, ray, ray->best);
+    if (ray->status == DIST_RAY_NOT_FINITE) return epsilon;
+    if (disti_ray_is_hit(tracer, ray)) return DISTI_MIN((tracer->how.trace == DIST_TRACE_PAPER ? f : magnitude) - epsilon, -tiny);
+    if (tracer->how.trace == DIST_TRACE_PAPER) return DISTI_MAX(magnitude - epsilon, tiny);
+    return DISTI_MAX(magnitude - epsilon, tiny);
+}
+
+static void disti_render_planes(const disti_render_job *job, const disti_tile *tile, const disti_bench *bench)
+{
+    const disti_tracer *tracer = job->tracer;
+    const dist_images *out = job->out;
+    for (int i = 0; i < tile->width * tile->height; i++) {
+        const disti_ray *ray = &bench->rays[i];
+        int x = tile->x + i % tile->width, y = tile->y + i / tile->width, hit = disti_ray_is_hit(tracer, ray);
+        size_t pixel = (size_t)y * (size_t)tile->view->width + (size_t)x;
+        double distance = ray->base + (double)ray->best, local[3];
+        disti_stats_ray(tracer, ray, bench->stats);
+        if (out->depth) {
+            disti_view_direction(tile->view, x, y, local);
+            out->depth[pixel] = hit ? (float)(distance * local[2]) : tracer->how.background;
+        }
+        if (out->distance) out->distance[pixel] = hit ? (float)distance : tracer->how.background;
+        if (out->silhouette) out->silhouette[pixel] = disti_ray_silhouette(tracer, ray);
+        if (out->mask) out->mask[pixel] = (unsigned char)hit;
+        if (out->status) out->status[pixel] = ray->status;
+        if (out->error) out->error[pixel] = hit ? ray->error : 0.0f;
+        if (out->normal) out->normal[3 * pixel] = out->normal[3 * pixel + 1] = out->normal[3 * pixel + 2] = 0.0f;
+        if (out->color) memcpy(out->color + 3 * pixel, tracer->how.background_color, 3 * sizeof(float));
+        if (!job->tape) continue;
+        int sampled = ray->enter < ray->leave && ray->fbest < 2e38f && ray->status != DIST_RAY_NOT_FINITE;
+        job->tape->s[pixel] = ray->best;
+        job->tape->status[pixel] = (unsigned char)(ray->status | (ray->status == DIST_RAY_HIT ? DISTI_TAPE_HIT : 0) |
+                                                   (sampled ? DISTI_TAPE_SAMPLE : 0));
+    }
+}
+
+static void disti_render_task(void *arg, int index, int worker)
+{
+    const disti_render_job *job = (const disti_render_job *)arg;
+    const disti_tracer *tracer = job->tracer;
+    disti_bench bench;
+    disti_tile tile;
+    double local[3];
+    disti_bench_init(tracer->ctx, worker, &bench);
+    tile.view = job->view;
+    tile.x = index % job->across * job->tile;
+    tile.y = index / job->across * job->tile;
+    tile.width = DISTI_MIN(job->tile, job->view->width - tile.x);
+    tile.height = DISTI_MIN(job->tile, job->view->height - tile.y);
+    int n = tile.width * tile.height;
+    for (int i = 0; i < n; i++)
+        disti_pixel_ray(job->view, tracer->field, tile.x + i % tile.width, tile.y + i / tile.width, local, &bench.rays[i]);
+#ifndef DIST_NO_PAPER
+    if (tracer->how.trace == DIST_TRACE_PAPER) {
+        size_t first = (size_t)tile.y * (size_t)job->view->width + (size_t)tile.x;
+        float *samples = job->tape ? job->tape->sample + first * (size_t)tracer->how.samples * 4 : NULL;
+        disti_paper_trace(tracer, worker, &tile, &bench, samples, (size_t)job->view->width);
+    } else
+#endif
+    {
+        if (!tracer->how.no_cones) disti_cones(tracer, worker, &tile, &bench);
+        disti_trace_rounds(tracer, worker, &bench, (size_t)n);
+        if (job->out->silhouette) disti_silhouette(tracer, worker, &tile, &bench);
+    }
+    disti_render_planes(job, &tile, &bench);
+    if (job->out->normal) disti_render_normals(job, worker, &tile, &bench);
+    if (job->out->color) disti_render_colors(job, worker, &tile, &bench);
+}
+
+DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, const dist_camera *camera, const dist_render_desc *desc,
+                                 const dist_images *out, dist_tape *tape)
+{
+    const char *name = "dist_render";
+    disti_tracer tracer;
+    disti_view view;
+    disti_render_job job;
+    dist_status status = disti_enter(ctx, name);
+    if (status == DIST_OK) status = disti_field_check(ctx, field, name);
+    if (status == DIST_OK) status = disti_camera_check(ctx, camera, name);
+    if (status == DIST_OK) status = disti_tracer_init(&tracer, ctx, field, desc, name);
+    if (status != DIST_OK) return status;
+    if (!out) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: out is NULL", name, 0, 0);
+    if (out->color && !field->color_fn)
+        return disti_fail(ctx, DIST_UNSUPPORTED, "%s: out.color is wanted, but the field has no color", name, 0, 0);
+    if (tape && tape->ctx != ctx) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: tape belongs to another context", name, 0, 0);
+    if (tape && (tape->width != camera->width || tape->height != camera->height))
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: tape is for another size than camera.width %d, height %d", name, camera->width,
+                          camera->height);
+    if (tape && (tape->trace != tracer.how.trace || (tape->sample && tape->samples != tracer.how.samples)))
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: tape was created with another trace or another number of samples", name, 0, 0);
+    disti_view_of(camera, &view);
+    disti_stats_begin(ctx);
+    job.tracer = &tracer;
+    job.view = &view;
+    job.out = out;
+    job.tape = tape;
+    job.tile = tracer.how.trace == DIST_TRACE_PAPER || (double)view.width * view.height < 384.0 * 384.0 ? DISTI_TILE / 2 : DISTI_TILE;
+    job.across = (view.width + job.tile - 1) / job.tile;
+    disti_run(ctx, job.across * ((view.height + job.tile - 1) / job.tile), disti_render_task, &job);
+    disti_stats_end(ctx, &tracer, out->stats);
+    if (!tape) return DIST_OK;
+    tape->rendered = 1;
+    tape->has_silhouette = out->silhouette != NULL;
+    tape->field = *field;
+    tape->camera = *camera;
+    tape->tracer = tracer;
+    tape->tracer.field = &tape->field;
+    return DIST_OK;
+}
+
+#ifndef DIST_NO_BACKWARD
+/* Backward of a picture, in terms of y = dL/dp, the pull on a point that moves with the field held still:
+
+   depth = distance * z of the unit ray in camera space, so d_t = d_depth z + d_distance.
+   implicit   f(c + t v) = 0 gives dt = -(df + grad f . (dc + t dv)) / (grad f . v): the seed a = -d_t / (grad f . v) on df,
+              and y = a grad f. |grad f . v| counts as at least tau |grad f|, its sign kept; such rays are counted.
+   normal     the same with d_t weighted by |n . v|, so that grazing pixels do not dominate.
+   paper      t = sum of alpha f(p_k) over the K samples of smallest |f|, points held constant, nothing where |f| > 0.1: the
+              seed alpha d_t at each p_k. The residual e of eq. (4) is dropped, and K samples are summed, not averaged: the
+              paper's approximation, in the scale of its authors' code.                                         (paper, 3.4)
+   silhouette S = f(p_min) - epsilon: the seed d_S at the sample of smallest |f|                           (envelope theorem)
+              off the sphere S = |o| - radius with o the closest approach: y = d_S o / |o|.
+   normal n = G / |G|: u = (d_n - n (n . d_n)) / |G| pulls on G. Of the field: u . dG, by differences of df: analytic
+              (df(p + h u^) - df(p - h u^)) |u| / (2 h), difference mode sum_i u_i (df(p + h e_i) - df(p - h e_i)) / (2 h);
+              and, but in the paper's mode, of the hit's motion: y += H u, d_t += v . H u, from grad f at the same points.
+
+   All of them end as seeds a on df and pulls y; for the camera, with q = R p and Y = R y: d_rotation -= q x Y,
+   d_translation -= Y; and a normal in camera space turns with it: d_rotation += n x d_n.                      */
+typedef struct disti_render_backward_job {
+    const dist_tape *tape;
+    const dist_images *d_out;
+    const dist_gradients *grads;
+    dist_context *ctx;
+    disti_view view;
+    double rotation[3], translation[3];
+    double *d_code;
+    unsigned long long capped, points, skipped;
+    size_t count;
+    int pose;
+} disti_render_backward_job;
+
+/* Seeds once grad f is known: d_sdf = entry's own, and the implicit rule's. */
+static void disti_render_seed(void *user, size_t first, size_t count, const float *sdf, const float *gradient, float *d_sdf)
+{
+    const dist_tape *tape = (const dist_tape *)user;
+    int mode = tape->tracer.how.gradient;
+    (void)sdf;
+    for (size_t i = 0; i < count; i++) {
+        disti_entry *entry = &tape->entry[first + i];
+        const float *g = gradient + 3 * i, *v = entry->direction;
+        d_sdf[i] = entry->d_sdf;
+        entry->capped = 0;
+        if (entry->d_distance == 0.0f) continue;
+        float length = disti_length(g[0], g[1], g[2]);
+        if (!disti_finite(length) || !(length > 1e-30f)) continue;
+        float along = (g[0] * v[0] + g[1] * v[1] + g[2] * v[2]) / length; /* n . v, in [-1, 1] */
+        float magnitude = along < 0.0f ? -along : along;
+        float least = tape->tracer.how.gradient_cap;
+        entry->capped = magnitude < least;
+        float weight = mode == DIST_GRADIENT_NORMAL ? magnitude : 1.0f;
+        float bounded = DISTI_MAX(magnitude, least);
+        /* at along = 0 the sign is that of a ray that enters */
+        d_sdf[i] += (along > 0.0f ? -1.0f : 1.0f) * entry->d_distance * weight / (bounded * length);
+    }
+}
+
+static void disti_add_pull(disti_render_backward_job *job, const double p[3], const double y[3])
+{
+    double q[3], turned[3], torque[3];
+    disti_rotate(job->view.rotation, p, q);
+    disti_rotate(job->view.rotation, y, turned);
+    disti_cross(q, turned, torque);
+    for (int i = 0; i < 3; i++) {
+        job->rotation[i] -= torque[i];
+        job->translation[i] -= turned[i];
+    }
+}
+
+/* Runs the adjoint over the entries gathered so far. */
+static void disti_backward_flush(disti_render_backward_job *job)
+{
+    const dist_tape *tape = job->tape;
+    const dist_field *field = &tape->field;
+    union {
+        const dist_tape *in;
+        void *out; /* the tape's work space is written through it */
+    } user;
+    if (job->count == 0) return;
+    user.in = tape;
+    memset(tape->d_points, 0, 3 * job->count * sizeof(float));
+    disti_field_backward_all(job->ctx, field, job->count, tape->points, tape->d_sdf, disti_render_seed, user.out,
+                             tape->d_points, job->d_code);
+    if (job->grads->weights)
+        field->weights_fn(field->user, job->ctx, job->count, tape->points, tape->d_sdf, NULL, NULL, NULL, NULL, job->grads->weights);
+    for (size_t i = 0; i < job->count; i++) {
+        job->capped += tape->entry[i].capped;
+        if (!job->pose) continue;
+        double p[3], y[3];
+        for (size_t k = 0; k < 3; k++) {
+            p[k] = (double)tape->points[3 * i + k];
+            y[k] = (double)tape->d_points[3 * i + k];
+        }
+        disti_add_pull(job, p, y);
+    }
+    job->points += job->count;
+    job->count = 0;
+}
+
+static void disti_backward_add(disti_render_backward_job *job, const disti_ray *ray, const float *point, float d_distance, float d_sdf)
+{
+    const dist_tape *tape = job->tape;
+    disti_entry *entry = &tape->entry[job->count];
+    entry->d_distance = d_distance;
+    entry->d_sdf = d_sdf;
+    memcpy(entry->direction, ray->direction, sizeof entry->direction);
+    memcpy(tape->points + 3 * job->count, point, 3 * sizeof(float));
+    if (++job->count == DISTI_CHUNK) disti_backward_flush(job);
+}
+
+/* The normal's share of one pixel: its differences become entries; returns what its motion adds to d_distance. */
+static float disti_backward_normal(disti_render_backward_job *job, const disti_ray *ray, const float *p, const float *d_normal)
+{
+    const disti_tracer *tracer = &job->tape->tracer;
+    const dist_field *field = &job->tape->field;
+    disti_bench bench;
+    float gradient[3], points[18], values[6], slopes[18], seeds[6], motion = 0.0f;
+    double g[3], n[3], d[3], u[3], turned[3], h = (double)tracer->how.normal_delta;
+    size_t count = tracer->how.normal_mode == DIST_NORMAL_ANALYTIC ? 2 : 6;
+    disti_bench_init(job->ctx, 0, &bench);
+    disti_normal_gradient(tracer, 0, &bench, 1, p, gradient);
+    for (int i = 0; i < 3; i++) {
+        g[i] = n[i] = (double)gradient[i];
+        d[i] = (double)d_normal[i];
+    }
+    if (!disti_normalize(n)) return 0.0f;
+    if (tracer->how.normal_space == DIST_SPACE_CAMERA) {
+        double seen[3], torque[3];
+        disti_rotate(job->view.rotation, n, seen);
+        disti_cross(seen, d, torque);
+        for (int i = 0; i < 3; i++) job->rotation[i] += torque[i];
+        disti_rotate_back(job->view.rotation, d, turned);
+        memcpy(d, turned, sizeof d);
+    }
+    double along = disti_dot(n, d), length = sqrt(disti_dot(g, g));
+    for (int i = 0; i < 3; i++) u[i] = (d[i] - n[i] * along) / length;
+    double pull = sqrt(disti_dot(u, u));
+    if (!(pull > 0.0)) return 0.0f;
+    for (size_t k = 0; k < count; k++) {
+        double side = k & 1 ? -1.0 : 1.0;
+        for (size_t i = 0; i < 3; i++) {
+            double shift = count == 2 ? u[i] / pull : k / 2 == i ? 1.0 : 0.0;
+            points[3 * k + i] = p[i] + (float)(side * h * shift);
+        }
+        seeds[k] = (float)(side * (count == 2 ? pull : u[k / 2]) / (2.0 * h));
+    }
+    if (tracer->how.gradient != DIST_GRADIENT_PAPER) {
+        unsigned state = disti_float_state_enter();
+        field->eval_fn(field->user, 0, count, points, values, slopes);
+        disti_float_state_leave(state);
+        for (size_t k = 0; k < count; k++)
+            for (size_t i = 0; i < 3; i++) motion += seeds[k] * slopes[3 * k + i] * ray->direction[i];
+    }
+    for (size_t k = 0; k < count; k++) disti_backward_add(job, ray, points + 3 * k, 0.0f, seeds[k]);
+    return disti_finite(motion) ? motion : 0.0f;
+}
+
+/* One pixel with an upstream gradient. */
+static void disti_backward_pixel(disti_render_backward_job *job, size_t pixel, float d_distance, float d_silhouette, const float *d_normal)
+{
+    const dist_tape *tape = job->tape;
+    const dist_field *field = &tape->field;
+    const disti_tracer *tracer = &tape->tracer;
+    unsigned char status = tape->status[pixel];
+    disti_ray ray;
+    double local[3];
+    float p[3];
+    int x = (int)(pixel % (size_t)tape->width), y = (int)(pixel / (size_t)tape->width);
+    disti_pixel_ray(&job->view, field, x, y, local, &ray);
+    if (ray.enter >= ray.leave) { /* off the sphere: only the camera feels it */
+        double o[3], pull[3], away[3];
+        for (int i = 0; i < 3; i++) {
+            o[i] = (double)ray.origin[i];
+            away[i] = o[i] - (double)field->center[i];
+        }
+        if (!disti_normalize(away)) return;
+        for (int i = 0; i < 3; i++) pull[i] = (double)d_silhouette * away[i];
+        disti_add_pull(job, o, pull);
+        return;
+    }
+    disti_ray_point(&ray, tape->s[pixel], p);
+    if (!(status & DISTI_TAPE_HIT)) d_distance = 0.0f;
+    if (!(status & DISTI_TAPE_SAMPLE)) d_silhouette = 0.0f;
+    if (d_normal && (status & DISTI_TAPE_HIT)) d_distance += disti_backward_normal(job, &ray, p, d_normal);
+    if (tape->sample) {
+        const float *samples = tape->sample + pixel * (size_t)tape->samples * 4;
+        int paper = tracer->how.gradient == DIST_GRADIENT_PAPER;
+        for (int k = 0; k < (paper ? tape->samples : 1); k++) {
+            float f = samples[4 * k], seed = k == 0 ? d_silhouette : 0.0f;
+            int inside_clamp = (f < 0.0f ? -f : f) <= 0.1f * field->radius;
+            if (paper && inside_clamp) seed += tracer->how.step_scale * d_distance;
+            if (seed != 0.0f) disti_backward_add(job, &ray, samples + 4 * k + 1, 0.0f, seed);
+        }
+        if (!paper && d_distance != 0.0f) disti_backward_add(job, &ray, p, d_distance, 0.0f);
+        return;
+    }
+    if (tracer->how.gradient == DIST_GRADIENT_PAPER) { /* all K samples are the hit */
+        d_silhouette += tracer->how.step_scale * (float)tracer->how.samples * d_distance;
+        d_distance = 0.0f;
+    }
+    if (d_distance != 0.0f || d_silhouette != 0.0f) disti_backward_add(job, &ray, p, d_distance, d_silhouette);
+}
+
+/* Upstream gradients that are not finite count as 0. */
+static float disti_upstream(const float *plane, size_t at)
+{
+    return plane && disti_finite(plane[at]) ? plane[at] : 0.0f;
+}
+
+static void disti_backward_pixels(disti_render_backward_job *job)
+{
+    const dist_tape *tape = job->tape;
+    const dist_images *d_out = job->d_out;
+    for (int y = 0; y < tape->height; y++) {
+        for (int x = 0; x < tape->width; x++) {
+            size_t pixel = (size_t)y * (size_t)tape->width + (size_t)x;
+            int hit = tape->status[pixel] & DISTI_TAPE_HIT;
+            float d_depth = hit ? disti_upstream(d_out->depth, pixel) : 0.0f;
+            float d_distance = hit ? disti_upstream(d_out->distance, pixel) : 0.0f;
+            float d_silhouette = disti_upstream(d_out->silhouette, pixel);
+            float d_normal[3] = {0.0f, 0.0f, 0.0f};
+            for (size_t k = 0; hit && d_out->normal && k < 3; k++) d_normal[k] = disti_upstream(d_out->normal, 3 * pixel + k);
+            int normal = d_normal[0] != 0.0f || d_normal[1] != 0.0f || d_normal[2] != 0.0f;
+            if (d_depth != 0.0f) {
+                double local[3];
+                disti_view_direction(&job->view, x, y, local);
+                d_distance += d_depth * (float)local[2];
+            }
+            if (d_distance == 0.0f && d_silhouette == 0.0f && !normal) {
+                job->skipped++;
+                continue;
+            }
+            disti_backward_pixel(job, pixel, d_distance, d_silhouette, normal ? d_normal : NULL);
+        }
+    }
+    disti_backward_flush(job);
+}
+
+DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *tape, const dist_images *d_out, const dist_gradients *grads)
+{
+    const char *name = "dist_render_backward";
+    disti_render_backward_job job;
+    dist_status status = disti_enter(ctx, name);
+    if (status != DIST_OK) return status;
+    if (!tape || !tape->rendered)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: tape is %s; it must have been filled by dist_render", tape ? "empty" : "NULL", 0, 0);
+    if (tape->ctx != ctx) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: tape belongs to another context", name, 0, 0);
+    if (!d_out) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: d_out is NULL", name, 0, 0);
+    status = disti_gradients_check(ctx, &tape->field, grads, name);
+    if (status != DIST_OK) return status;
+    if (d_out->silhouette && !tape->has_silhouette && tape->trace != DIST_TRACE_PAPER)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: d_out.silhouette is given, but out.silhouette was NULL in dist_render", name, 0, 0);
+    if (d_out->color) return disti_fail(ctx, DIST_UNSUPPORTED, "%s: d_out.color has no adjoint yet, must be NULL", name, 0, 0);
+    memset(&job, 0, sizeof job);
+    size_t size = (size_t)tape->field.code_size;
+    if (size + size / DISTI_SLOTS + 1 > ctx->partial_size)
+        return disti_fail(ctx, DIST_UNSUPPORTED, "%s: field.code_size is %d, at most %d here", name, (double)size,
+                          (double)ctx->partial_size - 40.0);
+    job.tape = tape;
+    job.d_out = d_out;
+    job.grads = grads;
+    job.ctx = ctx;
+    job.pose = grads->rotation != NULL || grads->translation != NULL;
+    disti_view_of(&tape->camera, &job.view);
+    if (grads->code) {
+        job.d_code = ctx->partial + (size_t)DISTI_SLOTS * size;
+        memset(job.d_code, 0, size * sizeof(double));
+    }
+    if (grads->code || grads->weights || job.pose) disti_backward_pixels(&job);
+    for (size_t j = 0; grads->code && j < size; j++) grads->code[j] += (float)job.d_code[j];
+    for (int i = 0; i < 3; i++) {
+        if (grads->rotation) grads->rotation[i] += (float)job.rotation[i];
+        if (grads->translation) grads->translation[i] += (float)job.translation[i];
+    }
+    if (d_out->stats) {
+        d_out->stats->capped += job.capped;
+        d_out->stats->backward_points += job.points;
+        d_out->stats->skipped += job.skipped;
+    }
+    return DIST_OK;
+}
+#endif
+
+/*@ 09 loss ---------------------------------------------------------------------------------------------------------------- */
+
+/* A pixel counts where the mask has a hit (no mask: everywhere). What is not finite never counts: one bad pixel must not
+   spoil the mean of the others. */
+static int disti_loss_hit(const unsigned char *mask, size_t i)
+{
+    return mask == NULL || mask[i] != 0;
+}
+
+static double disti_sign(double x)
+{
+    return x > 0.0 ? 1.0 : (x < 0.0 ? -1.0 : 0.0);
+}
+
+static int disti_loss_depth_counts(const float *depth, const float *target, const unsigned char *mask, size_t i)
+{
+    return disti_loss_hit(mask, i) && disti_finite(target[i]) && target[i] > 0.0f && target[i] < 1e5f && disti_finite(depth[i]);
+}
+
+/* forward   L = weight / N sum_i |depth_i - target_i|
+   backward  d_depth_i += weight / N sign(depth_i - target_i); 0 at the kink */
+DIST_API float dist_loss_depth(size_t n, const float *depth, const float *target, const unsigned char *mask, float weight,
+                               float *d_depth)
+{
+    double sum = 0.0;
+    size_t count = 0;
+    if (!depth || !target) return 0.0f;
+    for (size_t i = 0; i < n; i++) {
+        if (!disti_loss_depth_counts(depth, target, mask, i)) continue;
+        sum += fabs((double)depth[i] - (double)target[i]);
+        count++;
+    }
+    if (count == 0) return 0.0f;
+    double scale = (double)weight / (double)count;
+    for (size_t i = 0; d_depth && i < n; i++)
+        if (disti_loss_depth_counts(depth, target, mask, i))
+            d_depth[i] += (float)(scale * disti_sign((double)depth[i] - (double)target[i]));
+    return (float)(scale * sum);
+}
+
+/* 1 / |target|, or 0 where the pixel does not count. */
+static double disti_loss_normal_scale(const float *normal, const float *target, const unsigned char *mask, size_t i)
+{
+    const float *t = target + 3 * i;
+    if (!disti_loss_hit(mask, i) || !disti_finite_all(3, t) || !disti_finite_all(3, normal + 3 * i)) return 0.0;
+    double square = (double)t[0] * (double)t[0] + (double)t[1] * (double)t[1] + (double)t[2] * (double)t[2];
+    return square > 0.0 ? 1.0 / sqrt(square) : 0.0;
+}
+
+/* forward   L = -weight / N sum_i normal_i . target_i / |target_i|
+   backward  d_normal_i += -weight / N target_i / |target_i| */
+DIST_API float dist_loss_normal(size_t n, const float *normal, const float *target, const unsigned char *mask, float weight,
+                                float *d_normal)
+{
+    double sum = 0.0;
+    size_t count = 0;
+    if (!normal || !target) return 0.0f;
+    for (size_t i = 0; i < n; i++) {
+        double inverse = disti_loss_normal_scale(normal, target, mask, i);
+        if (!(inverse > 0.0)) continue;
+        for (size_t k = 3 * i; k < 3 * i + 3; k++) sum -= (double)normal[k] * (double)target[k] * inverse;
+        count++;
+    }
+    if (count == 0) return 0.0f;
+    double scale = (double)weight / (double)count;
+    for (size_t i = 0; d_normal && i < n; i++) {
+        double inverse = disti_loss_normal_scale(normal, target, mask, i);
+        if (!(inverse > 0.0)) continue;
+        for (size_t k = 3 * i; k < 3 * i + 3; k++) d_normal[k] -= (float)(scale * (double)target[k] * inverse);
+    }
+    return (float)(scale * sum);
+}
+
+/* forward   L = weight / N sum_i S_gt max(0, S_i) + (1 - S_gt) max(0, -S_i)                            (paper, eq. 8)
+   backward  d_S_i += weight / N where S_gt and S_i > 0, -= where not S_gt and S_i < 0; 0 at the kink */
+DIST_API float dist_loss_silhouette(size_t n, const float *silhouette, const unsigned char *target, float weight,
+                                    float *d_silhouette)
+{
+    double sum = 0.0;
+    size_t count = 0;
+    if (!silhouette || !target) return 0.0f;
+    for (size_t i = 0; i < n; i++) {
+        if (!disti_finite(silhouette[i])) continue;
+        double wrong = target[i] ? (double)silhouette[i] : -(double)silhouette[i];
+        sum += wrong > 0.0 ? wrong : 0.0;
+        count++;
+    }
+    if (count == 0) return 0.0f;
+    double scale = (double)weight / (double)count;
+    for (size_t i = 0; d_silhouette && i < n; i++) {
+        if (!disti_finite(silhouette[i])) continue;
+        if (target[i] && silhouette[i] > 0.0f) d_silhouette[i] += (float)scale;
+        if (!target[i] && silhouette[i] < 0.0f) d_silhouette[i] -= (float)scale;
+    }
+    return (float)(scale * sum);
+}
+
+static int disti_loss_color_counts(const float *color, const float *target, const unsigned char *mask, size_t i)
+{
+    return disti_loss_hit(mask, i) && disti_finite_all(3, color + 3 * i) && disti_finite_all(3, target + 3 * i);
+}
+
+/* forward   L = weight / (3 N) sum_i |color_i - target_i|_1
+   backward  d_color_i += weight / (3 N) sign(color_i - target_i); 0 at the kink */
+DIST_API float dist_loss_color(size_t n, const float *color, const float *target, const unsigned char *mask, float weight,
+                               float *d_color)
+{
+    double sum = 0.0;
+    size_t count = 0;
+    if (!color || !target) return 0.0f;
+    for (size_t i = 0; i < n; i++) {
+        if (!disti_loss_color_counts(color, target, mask, i)) continue;
+        for (size_t k = 3 * i; k < 3 * i + 3; k++) sum += fabs((double)color[k] - (double)target[k]);
+        count += 3;
+    }
+    if (count == 0) return 0.0f;
+    double scale = (double)weight / (double)count;
+    for (size_t i = 0; d_color && i < n; i++) {
+        if (!disti_loss_color_counts(color, target, mask, i)) continue;
+        for (size_t k = 3 * i; k < 3 * i + 3; k++)
+            d_color[k] += (float)(scale * disti_sign((double)color[k] - (double)target[k]));
+    }
+    return (float)(scale * sum);
+}
+
+/* forward   L = weight sum_j code_j^2
+   backward  d_code_j += 2 weight code_j */
+DIST_API float dist_loss_code(size_t n, const float *code, float weight, float *d_code)
+{
+    double sum = 0.0;
+    if (!code) return 0.0f;
+    for (size_t j = 0; j < n; j++) {
+        if (!disti_finite(code[j])) continue;
+        sum += (double)code[j] * (double)code[j];
+        if (d_code) d_code[j] += (float)(2.0 * (double)weight * (double)code[j]);
+    }
+    return (float)((double)weight * sum);
+}
+
+/*@ 10 optimizer ----------------------------------------------------------------------------------------------------------- */
+
+#ifndef DIST_NO_BACKWARD
+/* forward   m <- beta1 m + (1 - beta1) g,   v <- beta2 v + (1 - beta2) g^2
+             x <- x - rate (m / (1 - beta1^t)) / (sqrt(v / (1 - beta2^t)) + epsilon)
+   The second half of moments holds sqrt(v), not v: g^2 of 1e30 or 1e-30 does not fit a float, its root does. */
+DIST_API size_t dist_adam_step(dist_adam *adam, size_t n, float *x, const float *gradient)
+{
+    size_t skipped = 0;
+    if (!adam || !adam->moments || !x || !gradient) return 0;
+    double rate = adam->rate < 0.0f ? 0.0 : (adam->rate > 0.0f ? (double)adam->rate : 1e-2);
+    double beta1 = adam->beta1 > 0.0f && adam->beta1 < 1.0f ? (double)adam->beta1 : 0.9;
+    double beta2 = adam->beta2 > 0.0f && adam->beta2 < 1.0f ? (double)adam->beta2 : 0.999;
+    double epsilon = adam->epsilon > 0.0f ? (double)adam->epsilon : 1e-8;
+    if (adam->step < 0) adam->step = 0;
+    if (adam->step < 0x7fffffff) adam->step++;
+    double correction1 = 1.0 - pow(beta1, (double)adam->step);
+    double correction2 = sqrt(1.0 - pow(beta2, (double)adam->step));
+    float *first = adam->moments;
+    float *second = adam->moments + n;
+    for (size_t i = 0; i < n; i++) {
+        double g = (double)gradient[i];
+        if (!disti_finite(gradient[i])) {
+            skipped++;
+            continue;
+        }
+        double m = beta1 * (double)first[i] + (1.0 - beta1) * g;
+        double root = sqrt(beta2 * (double)second[i] * (double)second[i] + (1.0 - beta2) * g * g);
+        first[i] = (float)m;
+        second[i] = (float)root;
+        double step = rate * (m / correction1) / (root / correction2 + epsilon);
+        if (rate > 0.0) x[i] = (float)((double)x[i] - step);
+    }
+    return skipped;
+}
+#endif
+
+/*@ 11 mesh, metrics ------------------------------------------------------------------------------------------------------- */
+
+/* splitmix64: the same numbers everywhere for one seed. */
+DISTI_UNUSED static uint64_t disti_random_bits(uint64_t *state)
+{
+    uint64_t z = *state += 0x9e3779b97f4a7c15u;
+    z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9u;
+    z = (z ^ (z >> 27)) * 0x94d049bb133111ebu;
+    return z ^ (z >> 31);
+}
+
+#ifndef DIST_NO_MESH
+/* Uniform in [0, 1). */
+static double disti_random_unit(uint64_t *state)
+{
+    return (double)(disti_random_bits(state) >> 11) * (1.0 / 9007199254740992.0);
+}
+
+/* A copy of array with room for at least one element of `each` bytes more, half as large again; the old one is given
+   back. NULL on failure: then the old one stays and *capacity with it. */
+static void *disti_grow(dist_context *ctx, void *array, size_t *capacity, size_t each)
+{
+    size_t more, bytes;
+    if (!disti_size_add(*capacity, *capacity / 2 + 64, &more) || !disti_size_mul(more, each, &bytes)) bytes = (size_t)-1;
+    void *grown = disti_alloc(ctx, bytes);
+    if (!grown) return NULL;
+    if (array) memcpy(grown, array, *capacity * each);
+    disti_free(ctx, array, *capacity * each);
+    *capacity = more;
+    return grown;
+}
+
+static dist_mesh *disti_mesh_new(dist_context *ctx)
+{
+    dist_mesh *mesh = (dist_mesh *)disti_alloc(ctx, sizeof(dist_mesh));
+    if (!mesh) return NULL;
+    memset(mesh, 0, sizeof *mesh);
+    mesh->owner = ctx;
+    return mesh;
+}
+
+DIST_API void dist_mesh_destroy(dist_mesh *mesh)
+{
+    if (!mesh) return;
+    dist_context *ctx = mesh->owner;
+    disti_free(ctx, mesh->triangles, mesh->triangle_capacity * 3 * sizeof(unsigned));
+    disti_free(ctx, mesh->normals, mesh->vertex_capacity * 3 * sizeof(float));
+    disti_free(ctx, mesh->vertices, mesh->vertex_capacity * 3 * sizeof(float));
+    disti_free(ctx, mesh, sizeof *mesh);
+}
+
+/* Both append and return 1, or 0 after disti_fail. */
+static int disti_mesh_add_vertex(dist_mesh *mesh, const float p[3])
+{
+    if (mesh->vertex_count == mesh->vertex_capacity) {
+        float *grown = (float *)disti_grow(mesh->owner, mesh->vertices, &mesh->vertex_capacity, 3 * sizeof(float));
+        if (!grown) return 0;
+        mesh->vertices = grown;
+    }
+    if (mesh->vertex_count >= 0xfffffffeu) {
+        disti_fail(mesh->owner, DIST_UNSUPPORTED, "mesh: more than 4294967294 vertices", NULL, 0, 0);
+        return 0;
+    }
+    memcpy(mesh->vertices + 3 * mesh->vertex_count++, p, 3 * sizeof(float));
+    return 1;
+}
+
+static int disti_mesh_add_triangle(dist_mesh *mesh, unsigned a, unsigned b, unsigned c)
+{
+    if (mesh->triangle_count == mesh->triangle_capacity) {
+        unsigned *grown = (unsigned *)disti_grow(mesh->owner, mesh->triangles, &mesh->triangle_capacity, 3 * sizeof(unsigned));
+        if (!grown) return 0;
+        mesh->triangles = grown;
+    }
+    unsigned *t = mesh->triangles + 3 * mesh->triangle_count++;
+    t[0] = a;
+    t[1] = b;
+    t[2] = c;
+    return 1;
+}
+
+DIST_API dist_mesh *dist_mesh_create(dist_context *ctx, size_t vertex_count, const float *vertices, size_t triangle_count,
+                                     const unsigned *triangles)
+{
+    dist_mesh *mesh = NULL;
+    size_t vertex_bytes, triangle_bytes;
+    if (disti_enter(ctx, "dist_mesh_create") != DIST_OK) return NULL;
+    if ((vertex_count && !vertices) || (triangle_count && !triangles)) {
+        disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_create: %s is NULL, but its count is not 0",
+                   vertex_count && !vertices ? "vertices" : "triangles", 0, 0);
+        return NULL;
+    }
+    if (!disti_size_mul(vertex_count, 3 * sizeof(float), &vertex_bytes) ||
+        !disti_size_mul(triangle_count, 3 * sizeof(unsigned), &triangle_bytes)) {
+        disti_fail(ctx, DIST_OUT_OF_MEMORY, "dist_mesh_create: %d vertices and %d triangles do not fit memory", NULL,
+                   (double)vertex_count, (double)triangle_count);
+        return NULL;
+    }
+    for (size_t i = 0; i < vertex_count; i++) {
+        if (disti_finite_all(3, vertices + 3 * i)) continue;
+        disti_fail(ctx, DIST_NOT_FINITE, "dist_mesh_create: vertex %d is not finite", NULL, (double)i, 0);
+        return NULL;
+    }
+    for (size_t i = 0; i < 3 * triangle_count; i++) {
+        if (triangles[i] < vertex_count) continue;
+        disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_create: a triangle has vertex %d, must be below %d", NULL,
+                   (double)triangles[i], (double)vertex_count);
+        return NULL;
+    }
+    mesh = disti_mesh_new(ctx);
+    if (!mesh) return NULL;
+    if (vertex_count) mesh->vertices = (float *)disti_alloc(ctx, vertex_bytes);
+    if (vertex_count && !mesh->vertices) goto fail;
+    mesh->vertex_count = mesh->vertex_capacity = vertex_count;
+    if (triangle_count) mesh->triangles = (unsigned *)disti_alloc(ctx, triangle_bytes);
+    if (triangle_count && !mesh->triangles) goto fail;
+    mesh->triangle_count = mesh->triangle_capacity = triangle_count;
+    if (vertex_count) memcpy(mesh->vertices, vertices, vertex_bytes);
+    if (triangle_count) memcpy(mesh->triangles, triangles, triangle_bytes);
+    return mesh;
+fail:
+    dist_mesh_destroy(mesh);
+    return NULL;
+}
+
+/* Marching cubes. Corner c of a cell stands at (c & 1, c >> 1 & 1, c >> 2 & 1); bit c of a case is set where the corner is
+   inside, f < level. An edge is axis * 8 + its lower corner. The triangles of a case are derived, not tabulated: */
+typedef struct disti_case {
+    unsigned char triangles;
+    unsigned char edges[3 * 6]; /* six triangles are the most that occur */
+} disti_case;
+
+static int disti_edge(int a, int b)
+{
+    return ((a ^ b) >> 1) * 8 + (a & b); /* 1, 2, 4 >> 1 is the axis */
+}
+
+static int disti_edges_share_face(int e, int f)
+{
+    for (int axis = 0; axis < 3; axis++)
+        if (e >> 3 != axis && f >> 3 != axis && ((e ^ f) >> axis & 1) == 0) return 1;
+    return 0;
+}
+
+/* Where the surface goes from a crossed edge. Walking around a face counterclockwise as seen from outside the cell, each
+   edge that leaves the inside is joined to the edge where that run of inside corners was entered. The rule knows only the
+   face's own corners, so the two cells at a face draw the same segments, in opposite directions; on an ambiguous face it
+   keeps the two inside corners apart. Each crossed edge leaves on one of its faces and enters on the other: closed loops. */
+static void disti_case_links(int code, unsigned char link[24])
+{
+    memset(link, 0xff, 24);
+    for (int face = 0; face < 6; face++) {
+        int axis = face >> 1, u = 1 << (axis + 1) % 3, v = 1 << (axis + 2) % 3, base = (face & 1) << axis;
+        int corner[4];
+        corner[0] = base;
+        corner[1] = base | ((face & 1) ? u : v);
+        corner[2] = base | u | v;
+        corner[3] = base | ((face & 1) ? v : u);
+        for (int i = 0; i < 4; i++) {
+            int j = i, next = corner[(i + 1) & 3];
+            if (!(code >> corner[i] & 1) || (code >> next & 1)) continue;
+            while (code >> corner[(j + 3) & 3] & 1) j = (j + 3) & 3;
+            link[disti_edge(corner[(j + 3) & 3], corner[j])] = (unsigned char)disti_edge(corner[i], next);
+        }
+    }
+}
+
+/* Fans each loop from a vertex from which no diagonal lies in a face of the cell: a neighbor could draw the same diagonal,
+   and four triangles would meet in it. There is always one. */
+static void disti_cases(disti_case *cases)
+{
+    for (int code = 0; code < 256; code++) {
+        unsigned char link[24], loop[24];
+        disti_case *c = cases + code;
+        c->triangles = 0;
+        disti_case_links(code, link);
+        for (int first = 0; first < 24; first++) {
+            int n = 0, apex = 0;
+            for (int e = first; link[e] != 0xff;) {
+                int next = link[e];
+                loop[n++] = (unsigned char)e;
+                link[e] = 0xff;
+                e = next;
+            }
+            for (int good = 0; !good && n > 3; apex += !good) {
+                good = 1;
+                for (int k = 2; k < n - 1; k++)
+                    if (disti_edges_share_face(loop[apex], loop[(apex + k) % n])) good = 0;
+                DIST_ASSERT(good || apex + 1 < n);
+            }
+            for (int k = 1; k + 1 < n; k++) {
+                unsigned char *t = c->edges + 3 * c->triangles++;
+                DIST_ASSERT(c->triangles <= 6);
+                t[0] = loop[apex];
+                t[1] = loop[(apex + k) % n];
+                t[2] = loop[(apex + k + 1) % n];
+            }
+        }
+    }
+}
+
+enum { DISTI_MESH_BATCH = 8192 };
+
+/* The cube is walked layer by layer; a plane holds (cells + 1)^2 corners and everything that hangs on them. */
+typedef struct disti_extract {
+    dist_context *ctx;
+    const dist_field *field;
+    dist_mesh *mesh;
+    disti_case *cases;
+    float level;
+    size_t cells, side; /* side = cells + 1 corners */
+    size_t block;       /* cells along a block's side; blocks are left out as a whole */
+    size_t blocks;      /* along a side of the cube */
+    int no_skip;
+    float *value[2];         /* f - level's f at the layer's lower and upper corners */
+    unsigned char *known[2]; /* 1: value is there */
+    unsigned *edge[2][2];    /* [layer][axis]: vertex on the edge from this corner along x or y; ~0 none yet */
+    unsigned *upright;       /* ... along z, from lower to upper */
+    unsigned char *active;   /* (blocks, blocks) of the blocks that the layer cuts; 1: may hold the surface */
+    float *batch;            /* (DISTI_MESH_BATCH, 15) */
+    unsigned *where;         /* (DISTI_MESH_BATCH) */
+    void *memory;
+    size_t memory_bytes;
+} disti_extract;
+
+static float disti_extract_coordinate(const disti_extract *x, int axis, double cells)
+{
+    return (float)((double)x->field->center[axis] + (double)x->field->radius * (2.0 * cells / (double)x->cells - 1.0));
+}
+
+/* f at the first n points of the batch into the floats behind them; 0 after disti_fail if one is not finite. */
+static int disti_extract_eval(disti_extract *x, size_t n)
+{
+    float *sdf = x->batch + 3 * DISTI_MESH_BATCH;
+    disti_field_eval_all(x->ctx, x->field, n, x->batch, sdf, NULL);
+    if (disti_finite_all(n, sdf)) return 1;
+    disti_fail(x->ctx, DIST_NOT_FINITE, "dist_mesh_extract: the field is not finite everywhere in the cube", NULL, 0, 0);
+    return 0;
+}
+
+/* Marks the blocks of slab `slab` that may hold the surface: |f(center) - level| <= lipschitz * half diagonal. A clamped f
+   says no more than that the distance is at least the clamp. */
+static int disti_extract_mark(disti_extract *x, size_t slab)
+{
+    const dist_field *field = x->field;
+    const float *sdf = x->batch + 3 * DISTI_MESH_BATCH;
+    double half = 0.5 * (double)x->block;
+    double slope = 1.1 * (field->lipschitz > 0.0f ? (double)field->lipschitz : 1.0); /* the figure is often an estimate */
+    double reach = slope * 1.7320508075688772 * half * 2.0 * (double)field->radius / (double)x->cells;
+    size_t total = x->blocks * x->blocks;
+    if (x->no_skip) {
+        memset(x->active, 1, total);
+        return 1;
+    }
+    for (size_t from = 0; from < total; from += DISTI_MESH_BATCH) {
+        size_t n = DISTI_MIN(total - from, (size_t)DISTI_MESH_BATCH);
+        for (size_t i = 0; i < n; i++) {
+            size_t at[3];
+            at[0] = (from + i) % x->blocks;
+            at[1] = (from + i) / x->blocks;
+            at[2] = slab;
+            for (int k = 0; k < 3; k++)
+                x->batch[3 * i + (size_t)k] = disti_extract_coordinate(x, k, (double)(at[k] * x->block) + half);
+        }
+        if (!disti_extract_eval(x, n)) return 0;
+        for (size_t i = 0; i < n; i++) {
+            double f = (double)sdf[i];
+            if (field->clamp > 0.0f) f = DISTI_MAX(DISTI_MIN(f, (double)field->clamp), -(double)field->clamp);
+            x->active[from + i] = fabs(f - (double)x->level) <= reach;
+        }
+    }
+    return 1;
+}
+
+static int disti_extract_flush(disti_extract *x, int layer, size_t n)
+{
+    if (n == 0) return 1;
+    if (!disti_extract_eval(x, n)) return 0;
+    for (size_t i = 0; i < n; i++) x->value[layer][x->where[i]] = x->batch[3 * DISTI_MESH_BATCH + i];
+    return 1;
+}
+
+/* Evaluates the corners of active blocks in one of the two corner layers, which stands at height z. */
+static int disti_extract_fill(disti_extract *x, int layer, size_t z)
+{
+    size_t n = 0;
+    unsigned char *known = x->known[layer];
+    float height = disti_extract_coordinate(x, 2, (double)z);
+    for (size_t b = 0; b < x->blocks * x->blocks; b++) {
+        if (!x->active[b]) continue;
+        size_t x0 = b % x->blocks * x->block, y0 = b / x->blocks * x->block;
+        size_t x1 = DISTI_MIN(x0 + x->block, x->cells), y1 = DISTI_MIN(y0 + x->block, x->cells);
+        for (size_t i = y0 * x->side + x0; i <= y1 * x->side + x1; i += i % x->side == x1 ? x->side - (x1 - x0) : 1) {
+            if (known[i]) continue;
+            known[i] = 1;
+            x->where[n] = (unsigned)i;
+            x->batch[3 * n] = disti_extract_coordinate(x, 0, (double)(i % x->side));
+            x->batch[3 * n + 1] = disti_extract_coordinate(x, 1, (double)(i / x->side));
+            x->batch[3 * n + 2] = height;
+            if (++n < DISTI_MESH_BATCH) continue;
+            if (!disti_extract_flush(x, layer, n)) return 0;
+            n = 0;
+        }
+    }
+    return disti_extract_flush(x, layer, n);
+}
+
+/* The vertex on an edge of the cell at (cx, cy, cz), made where it is asked for first; 0 after disti_fail. */
+static int disti_extract_vertex(disti_extract *x, int edge, const size_t cell[3], unsigned *vertex)
+{
+    int axis = edge >> 3, layer = edge >> 2 & 1;
+    size_t step[3], corner[3];
+    for (int k = 0; k < 3; k++) corner[k] = cell[k] + (size_t)(edge >> k & 1);
+    step[0] = 1;
+    step[1] = x->side;
+    step[2] = 0;
+    size_t at = corner[1] * x->side + corner[0];
+    unsigned *slot = axis == 2 ? x->upright + at : x->edge[layer][axis] + at;
+    if (*slot == ~0u) {
+        double low = (double)x->value[layer][at], high = (double)x->value[axis == 2 ? 1 : layer][at + step[axis]];
+        double t = ((double)x->level - low) / (high - low); /* one is below the level, the other is not */
+        float p[3];
+        for (int k = 0; k < 3; k++) p[k] = disti_extract_coordinate(x, k, (double)corner[k] + (k == axis ? t : 0.0));
+        if (!disti_mesh_add_vertex(x->mesh, p)) return 0;
+        *slot = (unsigned)(x->mesh->vertex_count - 1);
+    }
+    *vertex = *slot;
+    return 1;
+}
+
+static int disti_extract_cell(disti_extract *x, const size_t cell[3])
+{
+    int code = 0;
+    size_t at = cell[1] * x->side + cell[0];
+    for (int c = 0; c < 8; c++)
+        code |= (x->value[c >> 2][at + (size_t)(c >> 1 & 1) * x->side + (size_t)(c & 1)] < x->level) << c;
+    const disti_case *found = x->cases + code;
+    for (int i = 0; i < found->triangles; i++) {
+        unsigned v[3];
+        for (int k = 0; k < 3; k++)
+            if (!disti_extract_vertex(x, found->edges[3 * i + k], cell, v + k)) return 0;
+        if (!disti_mesh_add_triangle(x->mesh, v[0], v[1], v[2])) return 0;
+    }
+    return 1;
+}
+
+/* The cells of layer z in active blocks. */
+static int disti_extract_layer(disti_extract *x, size_t z)
+{
+    for (size_t b = 0; b < x->blocks * x->blocks; b++) {
+        if (!x->active[b]) continue;
+        size_t x0 = b % x->blocks * x->block, y0 = b / x->blocks * x->block;
+        size_t width = DISTI_MIN(x->block, x->cells - x0), height = DISTI_MIN(x->block, x->cells - y0);
+        for (size_t i = 0; i < width * height; i++) {
+            size_t cell[3];
+            cell[0] = x0 + i % width;
+            cell[1] = y0 + i / width;
+            cell[2] = z;
+            if (!disti_extract_cell(x, cell)) return 0;
+        }
+    }
+    return 1;
+}
+
+/* What was the upper corner layer becomes the lower one. */
+static void disti_extract_advance(disti_extract *x)
+{
+    size_t plane = x->side * x->side;
+    float *value = x->value[0];
+    unsigned char *known = x->known[0];
+    x->value[0] = x->value[1];
+    x->value[1] = value;
+    x->known[0] = x->known[1];
+    x->known[1] = known;
+    memset(known, 0, plane);
+    for (int axis = 0; axis < 2; axis++) {
+        unsigned *edge = x->edge[0][axis];
+        x->edge[0][axis] = x->edge[1][axis];
+        x->edge[1][axis] = edge;
+        memset(edge, 0xff, plane * sizeof(unsigned));
+    }
+    memset(x->upright, 0xff, plane * sizeof(unsigned));
+}
+
+static int disti_extract_surface(disti_extract *x)
+{
+    for (size_t z = 0; z < x->cells; z++) {
+        if (z % x->block == 0) {
+            /* a block below may have been left out: the shared corners are then still to be evaluated */
+            if (!disti_extract_mark(x, z / x->block) || !disti_extract_fill(x, 0, z)) return 0;
+        }
+        if (!disti_extract_fill(x, 1, z + 1) || !disti_extract_layer(x, z)) return 0;
+        disti_extract_advance(x);
+    }
+    return 1;
+}
+
+/* Newton steps p <- p - (f - level) grad / |grad|^2, at most half a cell each, for up to a batch of vertices. A step that
+   brings f no nearer to the level is taken back and tried again at half its length. normals may be NULL. */
+static void disti_extract_polish(disti_extract *x, size_t n, int steps, float *vertices, float *normals)
+{
+    float *points = x->batch, *sdf = points + 3 * DISTI_MESH_BATCH, *gradient = sdf + DISTI_MESH_BATCH;
+    float *best = gradient + 3 * DISTI_MESH_BATCH, *slope = best + DISTI_MESH_BATCH, *scale = slope + 3 * DISTI_MESH_BATCH;
+    double longest = (double)x->field->radius / (double)x->cells;
+    memcpy(points, vertices, 3 * n * sizeof(float));
+    for (int step = 0; step <= steps; step++) {
+        disti_field_eval_all(x->ctx, x->field, n, points, sdf, gradient);
+        for (size_t i = 0; i < n; i++) {
+            float *v = vertices + 3 * i, *s = slope + 3 * i, *p = points + 3 * i;
+            float f = sdf[i] - x->level;
+            int good = disti_finite(f) && disti_finite_all(3, gradient + 3 * i);
+            if (step == 0 || (good && fabsf(f) < fabsf(best[i]))) {
+                best[i] = good ? f : 0.0f;
+                memcpy(v, p, 3 * sizeof(float));
+                for (size_t k = 0; k < 3; k++) s[k] = good ? gradient[3 * i + k] : 0.0f;
+                scale[i] = step == 0 ? 1.0f : scale[i];
+            } else {
+                scale[i] *= 0.5f;
+            }
+            double square = (double)s[0] * (double)s[0] + (double)s[1] * (double)s[1] + (double)s[2] * (double)s[2];
+            double length = sqrt(square);
+            double move = length > 0.0 ? (double)best[i] / length : 0.0;
+            move = (double)scale[i] * DISTI_MAX(DISTI_MIN(move, longest), -longest);
+            for (size_t k = 0; k < 3; k++) {
+                double unit = length > 0.0 ? (double)s[k] / length : 0.0;
+                p[k] = (float)((double)v[k] - move * unit);
+                if (normals && step == steps) normals[3 * i + k] = (float)unit;
+            }
+        }
+    }
+}
+
+/* One block of memory for all planes: O(cells^2). The bytes stand last, so that all else is aligned. */
+static int disti_extract_begin(disti_extract *x)
+{
+    size_t plane = x->side * x->side, blocks = x->blocks * x->blocks; /* at most 2049^2: fit 32 bits */
+    size_t words, bytes;
+    if (!disti_size_mul(plane, 7, &words) || !disti_size_add(words, 16 * DISTI_MESH_BATCH, &words) ||
+        !disti_size_mul(words, 4, &bytes) || !disti_size_add(bytes, 2 * plane + blocks, &bytes))
+        bytes = (size_t)-1;
+    x->memory = disti_alloc(x->ctx, bytes);
+    x->memory_bytes = bytes;
+    if (!x->memory) return 0;
+    float *floats = (float *)x->memory;
+    x->batch = floats;
+    x->value[0] = floats + 15 * DISTI_MESH_BATCH;
+    x->value[1] = x->value[0] + plane;
+    unsigned *indices = (unsigned *)x->memory + 15 * DISTI_MESH_BATCH + 2 * plane;
+    x->where = indices;
+    indices += DISTI_MESH_BATCH;
+    for (int i = 0; i < 4; i++) x->edge[i >> 1][i & 1] = indices + (size_t)i * plane;
+    x->upright = indices + 4 * plane;
+    x->known[0] = (unsigned char *)(x->upright + plane);
+    x->known[1] = x->known[0] + plane;
+    x->active = x->known[1] + plane;
+    memset(indices, 0xff, 5 * plane * sizeof(unsigned));
+    memset(x->known[0], 0, 2 * plane);
+    return 1;
+}
+
+/* Blocks of 8 cells, smaller where a clamped field could never rule one out; if 2 are still too many, all cells. */
+static void disti_extract_blocks(disti_extract *x)
+{
+    double slope = 1.1 * (x->field->lipschitz > 0.0f ? (double)x->field->lipschitz : 1.0);
+    double diagonal = slope * 1.7320508075688772 * (double)x->field->radius / (double)x->cells; /* half of one cell's */
+    double visible = (double)x->field->clamp - fabs((double)x->level);
+    x->block = 8;
+    while (x->field->clamp > 0.0f && x->block > 2 && diagonal * (double)x->block > 0.5 * visible) x->block /= 2;
+    if (x->field->clamp > 0.0f && diagonal * (double)x->block > visible) x->no_skip = 1;
+    x->blocks = (x->cells + x->block - 1) / x->block;
+}
+
+static dist_status disti_extract_check(dist_context *ctx, const dist_field *field, const dist_mesh_desc *desc)
+{
+    const char *name = "dist_mesh_extract";
+    dist_status status = disti_field_check(ctx, field, name);
+    if (status != DIST_OK || !desc) return status;
+    if (desc->resolution != 0 && (desc->resolution < 2 || desc->resolution > 2048))
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: resolution is %d, must be 2 to 2048, or 0", name, desc->resolution, 0);
+    if (desc->refine < 0 || desc->refine > 8)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: refine is %d, must be 0 to 8", name, desc->refine, 0);
+    if (!disti_finite(desc->level))
+        return disti_fail(ctx, DIST_NOT_FINITE, "%s: level is %d, must be finite", name, (double)desc->level, 0);
+    return DIST_OK;
+}
+
+DIST_API dist_mesh *dist_mesh_extract(dist_context *ctx, const dist_field *field, const dist_mesh_desc *desc)
+{
+    disti_extract x;
+    disti_case cases[256];
+    int refine = desc ? desc->refine : 0, normals = desc ? desc->normals : 0, good = 0;
+    if (disti_enter(ctx, "dist_mesh_extract") != DIST_OK || disti_extract_check(ctx, field, desc) != DIST_OK) return NULL;
+    memset(&x, 0, sizeof x);
+    x.ctx = ctx;
+    x.field = field;
+    x.cases = cases;
+    x.level = desc ? desc->level : 0.0f;
+    x.cells = desc && desc->resolution ? (size_t)desc->resolution : 128;
+    x.side = x.cells + 1;
+    x.no_skip = desc ? desc->no_skip : 0;
+    disti_extract_blocks(&x);
+    disti_cases(cases);
+    x.mesh = disti_mesh_new(ctx);
+    if (!x.mesh || !disti_extract_begin(&x) || !disti_extract_surface(&x)) goto done;
+    if (normals) {
+        x.mesh->normals = (float *)disti_alloc(ctx, x.mesh->vertex_capacity * 3 * sizeof(float)); /* as the vertices */
+        if (!x.mesh->normals) goto done;
+    }
+    for (size_t at = 0; (refine || normals) && at < x.mesh->vertex_count; at += DISTI_MESH_BATCH)
+        disti_extract_polish(&x, DISTI_MIN(x.mesh->vertex_count - at, (size_t)DISTI_MESH_BATCH), refine,
+                             x.mesh->vertices + 3 * at, normals ? x.mesh->normals + 3 * at : NULL);
+    good = 1;
+done:
+    disti_free(ctx, x.memory, x.memory_bytes);
+    if (good) return x.mesh;
+    dist_mesh_destroy(x.mesh);
+    return NULL;
+}
+
+#ifndef DIST_NO_BACKWARD
+/* forward   f(v) = level, so that a change of f moves the vertex by dv = -n df / |grad f|, n = grad f / |grad f|
+   backward  d_f_i = -(n . d_v_i) / |grad f| = -(grad f . d_v_i) / |grad f|^2; 0 where grad f is */
+static void disti_mesh_seed(void *user, size_t first, size_t count, const float *sdf, const float *gradient, float *d_sdf)
+{
+    const float *d_vertices = *(const float *const *)user;
+    (void)sdf;
+    for (size_t i = 0; i < count; i++) {
+        const float *g = gradient + 3 * i, *d_v = d_vertices + 3 * (first + i);
+        double dot = 0.0, square = 0.0;
+        for (size_t k = 0; k < 3; k++) {
+            dot += (double)g[k] * (double)d_v[k];
+            square += (double)g[k] * (double)g[k];
+        }
+        d_sdf[i] = disti_finite_all(3, g) && square > 0.0 ? (float)(-dot / square) : 0.0f;
+    }
+}
+
+DIST_API dist_status dist_mesh_backward(dist_context *ctx, const dist_field *field, const dist_mesh *mesh,
+                                        const float *d_vertices, const dist_gradients *grads)
+{
+    enum { CHUNK = 4096 };
+    float d_sdf[CHUNK];
+    dist_status status = disti_enter(ctx, "dist_mesh_backward");
+    if (status != DIST_OK) return status;
+    if (!mesh || (mesh->vertex_count && !d_vertices))
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_backward: %s is NULL", mesh ? "d_vertices" : "mesh", 0, 0);
+    for (size_t i = 0; i < mesh->vertex_count; i++)
+        if (!disti_finite_all(3, d_vertices + 3 * i))
+            return disti_fail(ctx, DIST_NOT_FINITE, "dist_mesh_backward: d_vertices of vertex %d is not finite", NULL,
+                              (double)i, 0);
+    if (mesh->vertex_count == 0) return dist_field_backward(ctx, field, 0, NULL, NULL, NULL, NULL, NULL, grads);
+    for (size_t at = 0; status == DIST_OK && at < mesh->vertex_count; at += CHUNK) {
+        const float *d_chunk = d_vertices + 3 * at;
+        size_t n = DISTI_MIN(mesh->vertex_count - at, (size_t)CHUNK);
+        status = dist_field_backward(ctx, field, n, mesh->vertices + 3 * at, d_sdf, disti_mesh_seed, &d_chunk, NULL, grads);
+    }
+    return status;
+}
+#endif
+
+static double disti_triangle_area(const dist_mesh *mesh, size_t i)
+{
+    const unsigned *t = mesh->triangles + 3 * i;
+    double u[3], v[3], c[3];
+    for (int k = 0; k < 3; k++) {
+        double a = (double)mesh->vertices[3 * (size_t)t[0] + (size_t)k];
+        u[k] = (double)mesh->vertices[3 * (size_t)t[1] + (size_t)k] - a;
+        v[k] = (double)mesh->vertices[3 * (size_t)t[2] + (size_t)k] - a;
+    }
+    for (int k = 0; k < 3; k++) c[k] = u[(k + 1) % 3] * v[(k + 2) % 3] - u[(k + 2) % 3] * v[(k + 1) % 3];
+    return 0.5 * sqrt(c[0] * c[0] + c[1] * c[1] + c[2] * c[2]);
+}
+
+/* p = (1 - s) a + s (1 - w) b + s w c, s = sqrt(unit), is uniform over the triangle. */
+static void disti_mesh_draw(const dist_mesh *mesh, size_t triangle, double s, double w, float *p)
+{
+    const unsigned *t = mesh->triangles + 3 * triangle;
+    for (size_t k = 0; k < 3; k++) {
+        double a = (double)mesh->vertices[3 * (size_t)t[0] + k], b = (double)mesh->vertices[3 * (size_t)t[1] + k];
+        double c = (double)mesh->vertices[3 * (size_t)t[2] + k];
+        p[k] = (float)((1.0 - s) * a + s * ((1.0 - w) * b + w * c));
+    }
+}
+
+DIST_API dist_status dist_mesh_sample(dist_context *ctx, const dist_mesh *mesh, unsigned seed, size_t n, float *points)
+{
+    const char *name = "dist_mesh_sample";
+    size_t bytes, count = mesh ? mesh->triangle_count : 0;
+    uint64_t random = seed;
+    double sum = 0.0;
+    dist_status status = disti_enter(ctx, name);
+    if (status != DIST_OK) return status;
+    if (!mesh || (n && !points))
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_sample: %s is NULL", mesh ? "points" : "mesh", 0, 0);
+    if (count == 0) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: the mesh has no triangles", name, 0, 0);
+    disti_size_mul(count, sizeof(double), &bytes);
+    double *until = (double *)disti_alloc(ctx, bytes); /* area of the triangles up to and with this one */
+    if (!until) return DIST_OUT_OF_MEMORY;
+    for (size_t i = 0; i < count; i++) {
+        const unsigned *t = mesh->triangles + 3 * i;
+        if (t[0] < mesh->vertex_count && t[1] < mesh->vertex_count && t[2] < mesh->vertex_count) {
+            until[i] = sum += disti_triangle_area(mesh, i);
+        } else {
+            status = disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: triangle %d has a vertex out of range", name, (double)i, 0);
+            goto done;
+        }
+    }
+    if (!disti_finite_double(sum) || !(sum > 0.0)) {
+        status = disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: the mesh's area is %d, must be positive", name, sum, 0);
+        goto done;
+    }
+    for (size_t i = 0; i < n; i++) {
+        double target = disti_random_unit(&random) * sum;
+        size_t low = 0, high = count - 1;
+        while (low < high) { /* the first triangle that ends beyond the target: never one without area */
+            size_t middle = low + (high - low) / 2;
+            if (until[middle] > target) high = middle;
+            else low = middle + 1;
+        }
+        double s = sqrt(disti_random_unit(&random));
+        disti_mesh_draw(mesh, low, s, disti_random_unit(&random), points + 3 * i);
+    }
+done:
+    disti_free(ctx, until, bytes);
+    return status;
+}
+
+/* A balanced tree over a copy of the points: node i has children 2i + 1 and 2i + 2, halves its range at the middle along
+   its longest side, and keeps the box around its points. Balance follows from ranks, not from coordinates, so equal
+   points, lines and outliers cost nothing extra; the tight boxes do the pruning. */
+typedef struct disti_tree {
+    float *points; /* (n, 3), permuted */
+    float *boxes;  /* (nodes, 6): low, high */
+    size_t n, nodes;
+    int depth;
+} disti_tree;
+
+static void disti_swap_points(float *a, float *b)
+{
+    float t[3];
+    memcpy(t, a, sizeof t);
+    memcpy(a, b, sizeof t);
+    memcpy(b, t, sizeof t);
+}
+
+/* Puts the point of rank `rank` along `axis` in its place, smaller ones before and larger ones after it. The pivot is drawn
+   at random and both scans stop at equals: linear for every order of the points, also with many equal ones. */
+static void disti_tree_select(float *points, ptrdiff_t low, ptrdiff_t high, ptrdiff_t rank, size_t axis)
+{
+    uint64_t random = (uint64_t)(high - low);
+    while (low < high) { /* high is the last, not one beyond it */
+        float pivot = points[3 * (low + (ptrdiff_t)(disti_random_bits(&random) % (uint64_t)(high - low + 1))) + (ptrdiff_t)axis];
+        ptrdiff_t i = low, j = high;
+        while (i <= j) {
+            while (points[3 * (size_t)i + axis] < pivot) i++;
+            while (points[3 * (size_t)j + axis] > pivot) j--;
+            if (i <= j) disti_swap_points(points + 3 * i++, points + 3 * j--);
+        }
+        if (rank > j && rank < i) return; /* what lies between equals the pivot */
+        if (rank <= j) high = j;
+        else low = i;
+    }
+}
+
+static void disti_tree_build(disti_tree *tree, size_t node, size_t low, size_t high, int level)
+{
+    float *box = tree->boxes + 6 * node;
+    memcpy(box, tree->points + 3 * low, 3 * sizeof(float));
+    memcpy(box + 3, tree->points + 3 * low, 3 * sizeof(float));
+    for (size_t i = low + 1; i < high; i++)
+        for (size_t k = 0; k < 3; k++) {
+            float p = tree->points[3 * i + k];
+            box[k] = DISTI_MIN(box[k], p);
+            box[3 + k] = DISTI_MAX(box[3 + k], p);
+        }
+    if (level == tree->depth) return;
+    size_t axis = 0, middle = low + (high - low) / 2;
+    for (size_t k = 1; k < 3; k++)
+        if ((double)box[3 + k] - (double)box[k] > (double)box[3 + axis] - (double)box[axis]) axis = k;
+    disti_tree_select(tree->points, (ptrdiff_t)low, (ptrdiff_t)high - 1, (ptrdiff_t)middle, axis);
+    disti_tree_build(tree, 2 * node + 1, low, middle, level + 1);
+    disti_tree_build(tree, 2 * node + 2, middle, high, level + 1);
+}
+
+/* Copies and sorts n > 0 points; leaves hold 4 to 8. 0 after disti_fail. */
+static int disti_tree_begin(dist_context *ctx, disti_tree *tree, size_t n, const float *points)
+{
+    size_t point_bytes, box_bytes;
+    tree->n = n;
+    while (n >> tree->depth > 8) tree->depth++;
+    tree->nodes = ((size_t)2 << tree->depth) - 1;
+    disti_size_mul(n, 3 * sizeof(float), &point_bytes);
+    disti_size_mul(tree->nodes, 6 * sizeof(float), &box_bytes);
+    tree->points = (float *)disti_alloc(ctx, point_bytes);
+    if (!tree->points) return 0;
+    tree->boxes = (float *)disti_alloc(ctx, box_bytes);
+    if (!tree->boxes) return 0;
+    memcpy(tree->points, points, point_bytes);
+    disti_tree_build(tree, 0, 0, n, 0);
+    return 1;
+}
+
+static void disti_tree_end(dist_context *ctx, disti_tree *tree)
+{
+    disti_free(ctx, tree->boxes, tree->nodes * 6 * sizeof(float));
+    disti_free(ctx, tree->points, tree->n * 3 * sizeof(float));
+}
+
+static double disti_square_distance(const float *p, const float *q)
+{
+    double x = (double)p[0] - (double)q[0], y = (double)p[1] - (double)q[1], z = (double)p[2] - (double)q[2];
+    return x * x + y * y + z * z;
+}
+
+static double disti_box_distance(const float *box, const float *p)
+{
+    double sum = 0.0;
+    for (int k = 0; k < 3; k++) {
+        double below = (double)box[k] - (double)p[k], above = (double)p[k] - (double)box[3 + k];
+        double d = DISTI_MAX(DISTI_MAX(below, above), 0.0);
+        sum += d * d;
+    }
+    return sum;
+}
+
+/* Squared distance from p to its nearest point; *hint is a guess at that point, in, and it, out. */
+static double disti_tree_nearest(const disti_tree *tree, const float *p, size_t *hint)
+{
+    struct {
+        double distance;
+        size_t node, low, high;
+    } stack[80];
+    int level, top = 0;
+    size_t node = 0, low = 0, high = tree->n;
+    double best = disti_square_distance(tree->points + 3 * *hint, p), distance = disti_box_distance(tree->boxes, p);
+    for (;;) {
+        while (distance < best && 2 * node + 2 < tree->nodes) {
+            size_t middle = low + (high - low) / 2;
+            double left = disti_box_distance(tree->boxes + 6 * (2 * node + 1), p);
+            double right = disti_box_distance(tree->boxes + 6 * (2 * node + 2), p);
+            int near_right = right < left;
+            double far_distance = near_right ? left : right;
+            if (far_distance < best) {
+                stack[top].distance = far_distance;
+                stack[top].node = 2 * node + (near_right ? 1 : 2);
+                stack[top].low = near_right ? low : middle;
+                stack[top++].high = near_right ? middle : high;
+            }
+            distance = near_right ? right : left;
+            node = 2 * node + (near_right ? 2 : 1);
+            if (near_right) low = middle;
+            else high = middle;
+        }
+        for (size_t i = low; distance < best && i < high; i++) {
+            double d = disti_square_distance(tree->points + 3 * i, p);
+            if (!(d < best)) continue;
+            best = d;
+            *hint = i;
+        }
+        do {
+            if (top == 0) return best;
+            level = --top;
+        } while (!(stack[level].distance < best));
+        distance = stack[level].distance;
+        node = stack[level].node;
+        low = stack[level].low;
+        high = stack[level].high;
+    }
+}
+
+typedef struct disti_chamfer_job {
+    const disti_tree *from, *to;
+    disti_pieces pieces;
+    double *sums; /* one for each piece */
+} disti_chamfer_job;
+
+/* The points come in the order of their own tree: neighbors follow each other and the last answer is a good first guess. */
+static void disti_chamfer_task(void *arg, int index, int worker)
+{
+    const disti_chamfer_job *job = (const disti_chamfer_job *)arg;
+    size_t first = (size_t)index * job->pieces.size, hint = 0;
+    size_t n = DISTI_MIN(job->pieces.size, job->pieces.n - first);
+    double sum = 0.0;
+    (void)worker;
+    for (size_t i = first; i < first + n; i++) sum += disti_tree_nearest(job->to, job->from->points + 3 * i, &hint);
+    job->sums[index] = sum;
+}
+
+static dist_status disti_chamfer_one_way(dist_context *ctx, const disti_tree *from, const disti_tree *to, double *mean)
+{
+    disti_chamfer_job job;
+    double sum = 0.0;
+    job.from = from;
+    job.to = to;
+    job.pieces = disti_cut(from->n, 1024, 1u << 16);
+    size_t bytes = (size_t)job.pieces.count * sizeof(double); /* at most 2^16 pieces */
+    job.sums = (double *)disti_alloc(ctx, bytes);
+    if (!job.sums) return DIST_OUT_OF_MEMORY;
+    disti_run(ctx, job.pieces.count, disti_chamfer_task, &job);
+    for (int i = 0; i < job.pieces.count; i++) sum += job.sums[i];
+    disti_free(ctx, job.sums, bytes);
+    *mean = sum / (double)from->n;
+    return DIST_OK;
+}
+
+static dist_status disti_chamfer_check(dist_context *ctx, size_t n, const float *points, const char *what)
+{
+    if (n == 0) return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_chamfer: %s has no points", what, 0, 0);
+    if (!points) return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_chamfer: %s is NULL", what, 0, 0);
+    for (size_t i = 0; i < n; i++)
+        if (!disti_finite_all(3, points + 3 * i))
+            return disti_fail(ctx, DIST_NOT_FINITE, "dist_chamfer: point %d of %s is not finite", what, (double)i, 0);
+    return DIST_OK;
+}
+
+DIST_API dist_status dist_chamfer(dist_context *ctx, size_t n, const float *a, size_t m, const float *b, double *chamfer,
+                                  double one_way[2])
+{
+    disti_tree trees[2];
+    double parts[2];
+    dist_status status = disti_enter(ctx, "dist_chamfer");
+    if (status == DIST_OK) status = disti_chamfer_check(ctx, n, a, "a");
+    if (status == DIST_OK) status = disti_chamfer_check(ctx, m, b, "b");
+    if (status != DIST_OK) return status;
+    if (!chamfer && !one_way) return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_chamfer: chamfer is NULL", NULL, 0, 0);
+    memset(trees, 0, sizeof trees);
+    if (!disti_tree_begin(ctx, trees, n, a) || !disti_tree_begin(ctx, trees + 1, m, b)) status = DIST_OUT_OF_MEMORY;
+    if (status == DIST_OK) status = disti_chamfer_one_way(ctx, trees, trees + 1, parts);
+    if (status == DIST_OK) status = disti_chamfer_one_way(ctx, trees + 1, trees, parts + 1);
+    if (status == DIST_OK && chamfer) *chamfer = parts[0] + parts[1];
+    if (status == DIST_OK && one_way) memcpy(one_way, parts, sizeof parts);
+    disti_tree_end(ctx, trees + 1);
+    disti_tree_end(ctx, trees);
+    return status;
+}
+#endif
+
+/*@ 12 files --------------------------------------------------------------------------------------------------------------- */
+
+/* Where a file in memory is written: counts always, stores while out is not NULL. */
+typedef struct disti_sink {
+    unsigned char *out;
+    size_t size; /* SIZE_MAX: it does not fit */
+} disti_sink;
+
+static void disti_sink_bytes(disti_sink *sink, const void *bytes, size_t n)
+{
+    if (sink->out) memcpy(sink->out + sink->size, bytes, n);
+    disti_size_add(sink->size, n, &sink->size);
+}
+
+static void disti_sink_text(disti_sink *sink, const char *text)
+{
+    disti_sink_bytes(sink, text, strlen(text));
+}
+
+static void disti_sink_integer(disti_sink *sink, size_t x)
+{
+    char text[24];
+    size_t at = sizeof text;
+    do text[--at] = (char)('0' + (int)(x % 10u));
+    while ((x /= 10u) != 0);
+    disti_sink_bytes(sink, text + at, sizeof text - at);
+}
+
+/* Little-endian on every machine. */
+static void disti_sink_word(disti_sink *sink, uint32_t x)
+{
+    unsigned char bytes[4];
+    for (int i = 0; i < 4; i++) bytes[i] = (unsigned char)(x >> 8 * i & 255u);
+    disti_sink_bytes(sink, bytes, sizeof bytes);
+}
+
+static void disti_sink_float(disti_sink *sink, float x)
+{
+    uint32_t bits;
+    memcpy(&bits, &x, sizeof bits);
+    disti_sink_word(sink, bits);
+}
+
+/* Text at hand while a file in memory is read; it has no terminating 0. */
+typedef struct disti_text {
+    const char *at;
+    const char *end;
+} disti_text;
+
+static int disti_is_space(char c)
+{
+    return c == ' ' || (c >= '\t' && c <= '\r');
+}
+
+static void disti_skip_space(disti_text *t)
+{
+    while (t->at < t->end && disti_is_space(*t->at)) t->at++;
+}
+
+/* A whole number, up to 2^53; 0 if there is none here. */
+static int disti_text_integer(disti_text *t, int64_t *out)
+{
+    const char *c = t->at;
+    int negative = c < t->end && *c == '-';
+    int64_t value = 0;
+    if (c < t->end && (*c == '-' || *c == '+')) c++;
+    const char *digits = c;
+    for (; c < t->end && *c >= '0' && *c <= '9'; c++) {
+        if (value >= (int64_t)1 << 53) return 0;
+        value = value * 10 + (*c - '0');
+    }
+    if (c == digits) return 0;
+    t->at = c;
+    *out = negative ? -value : value;
+    return 1;
+}
+
+/* A number as people write it: also .5 and 5. which disti_parse_double does not take; 0 if there is none here. */
+static int disti_text_number(disti_text *t, double *out)
+{
+    char copy[64];
+    size_t n = 0;
+    const char *c = t->at, *cursor = copy;
+    for (; c < t->end && n + 2 < sizeof copy && (*c == '+' || (*c >= '-' && *c <= '9' && *c != '/') || *c == 'e' || *c == 'E'); c++) {
+        if (*c == '.' && (n == 0 || copy[n - 1] < '0')) copy[n++] = '0';
+        if (*c != '.' || (c + 1 < t->end && c[1] >= '0' && c[1] <= '9')) copy[n++] = *c;
+    }
+    if (n + 2 >= sizeof copy) return disti_parse_double(&t->at, t->end, out);
+    if (!disti_parse_double(&cursor, copy + n, out) || cursor != copy + n) return 0;
+    t->at = c;
+    return 1;
+}
+
+static dist_status disti_pfm_check(dist_context *ctx, const char *name, int width, int height, int channels, size_t *floats)
+{
+    dist_status status = disti_enter(ctx, name);
+    if (status != DIST_OK) return status;
+    if (width < 1 || height < 1)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: the picture is %d x %d, must be at least 1 x 1", name, width, height);
+    if (channels != 1 && channels != 3)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: channels is %d, must be 1 or 3", name, channels, 0);
+    if (!disti_size_mul((size_t)width, (size_t)height, floats) || !disti_size_mul(*floats, (size_t)channels, floats) ||
+        *floats > ((size_t)-1 - 64) / 4)
+        return disti_fail(ctx, DIST_OUT_OF_MEMORY, "%s: %d x %d pixels do not fit memory", name, width, height);
+    return DIST_OK;
+}
+
+DIST_API dist_status dist_pfm_write(dist_context *ctx, int width, int height, int channels, const float *pixels, void *buffer,
+                                    size_t capacity, size_t *size)
+{
+    const char *name = "dist_pfm_write";
+    size_t floats = 0;
+    disti_sink sink;
+    unsigned char header[64];
+    dist_status status = disti_pfm_check(ctx, name, width, height, channels, &floats);
+    if (status != DIST_OK) return status;
+    if (!size) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: size is NULL", name, 0, 0);
+    sink.out = header;
+    sink.size = 0;
+    disti_sink_text(&sink, channels == 3 ? "PF\n" : "Pf\n");
+    disti_sink_integer(&sink, (size_t)width);
+    disti_sink_text(&sink, " ");
+    disti_sink_integer(&sink, (size_t)height);
+    disti_sink_text(&sink, "\n-1.0\n"); /* negative: little-endian */
+    *size = sink.size + 4 * floats;
+    if (!buffer) return DIST_OK;
+    if (!pixels) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: pixels is NULL", name, 0, 0);
+    if (capacity < *size)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: capacity is %d, must be %d", name, (double)capacity, (double)*size);
+    memcpy(buffer, header, sink.size);
+    sink.out = (unsigned char *)buffer;
+    size_t row = (size_t)width * (size_t)channels;
+    for (size_t y = (size_t)height; y-- > 0;)
+        for (size_t i = 0; i < row; i++) disti_sink_float(&sink, pixels[y * row + i]);
+    return DIST_OK;
+}
+
+typedef struct disti_pfm {
+    int width, height, channels, big_endian;
+    size_t floats;
+    const unsigned char *data; /* bottom row first */
+} disti_pfm;
+
+/* label: what to call the file in a sentence. All of the picture is there when this succeeds. */
+static dist_status disti_pfm_parse(dist_context *ctx, const char *label, const void *bytes, size_t size, disti_pfm *pfm)
+{
+    disti_text t;
+    int64_t side[2];
+    double scale = 0.0;
+    t.at = (const char *)bytes;
+    t.end = t.at + size;
+    if (size < 3 || t.at[0] != 'P' || (t.at[1] != 'f' && t.at[1] != 'F') || !disti_is_space(t.at[2]))
+        return disti_fail(ctx, DIST_BAD_FILE, "dist_pfm_read (%s): not a PFM file, must begin with Pf or PF", label, 0, 0);
+    pfm->channels = t.at[1] == 'F' ? 3 : 1;
+    t.at += 2;
+    for (int i = 0; i < 2; i++) {
+        disti_skip_space(&t);
+        if (!disti_text_integer(&t, side + i) || side[i] < 1 || side[i] > 0x7fffffff || t.at == t.end || !disti_is_space(*t.at))
+            return disti_fail(ctx, DIST_BAD_FILE, "dist_pfm_read (%s): width or height is no number from 1 to 2147483647",
+                              label, 0, 0);
+    }
+    disti_skip_space(&t);
+    if (!disti_text_number(&t, &scale) || !(scale < 0.0 || scale > 0.0) || t.at == t.end || !disti_is_space(*t.at))
+        return disti_fail(ctx, DIST_BAD_FILE, "dist_pfm_read (%s): the scale is not a number other than 0", label, 0, 0);
+    pfm->width = (int)side[0];
+    pfm->height = (int)side[1];
+    pfm->big_endian = scale > 0.0;
+    size_t left = (size_t)(t.end - t.at) - 1, need;
+    if (!disti_size_mul((size_t)side[0], (size_t)side[1], &pfm->floats) ||
+        !disti_size_mul(pfm->floats, (size_t)pfm->channels, &pfm->floats) || !disti_size_mul(pfm->floats, 4, &need) || need > left)
+        return disti_fail(ctx, DIST_BAD_FILE, "dist_pfm_read (%s): truncated, %d bytes of pixels are there", label, (double)left, 0);
+    /* one white space ends the header; of \r\n the second is the picture's first byte unless there is one to spare */
+    int pair = t.at[0] == '\r' && left > need && t.at[1] == '\n';
+    const unsigned char *first = (const unsigned char *)bytes;
+    pfm->data = first + (t.at - (const char *)bytes) + (pair ? 2 : 1);
+    return DIST_OK;
+}
+
+static void disti_pfm_pixels(const disti_pfm *pfm, float *pixels)
+{
+    size_t row = (size_t)pfm->width * (size_t)pfm->channels;
+    const unsigned char *in = pfm->data;
+    for (size_t y = (size_t)pfm->height; y-- > 0;)
+        for (size_t i = 0; i < row; i++, in += 4) {
+            uint32_t bits = 0;
+            for (int k = 0; k < 4; k++) bits |= (uint32_t)in[k] << 8 * (pfm->big_endian ? 3 - k : k);
+            memcpy(pixels + y * row + i, &bits, sizeof bits);
+        }
+}
+
+DIST_API dist_status dist_pfm_read(dist_context *ctx, const void *bytes, size_t size, int *width, int *height, int *channels,
+                                   float *pixels, size_t capacity)
+{
+    disti_pfm pfm;
+    dist_status status = disti_enter(ctx, "dist_pfm_read");
+    if (status != DIST_OK) return status;
+    if (!bytes || !width || !height || !channels)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_pfm_read: %s is NULL", bytes ? "width, height or channels" : "bytes", 0, 0);
+    status = disti_pfm_parse(ctx, "in memory", bytes, size, &pfm);
+    if (status != DIST_OK) return status;
+    if (pixels && capacity < pfm.floats)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_pfm_read: capacity is %d floats, must be %d", NULL, (double)capacity,
+                          (double)pfm.floats);
+    *width = pfm.width;
+    *height = pfm.height;
+    *channels = pfm.channels;
+    if (pixels) disti_pfm_pixels(&pfm, pixels);
+    return DIST_OK;
+}
+
+DIST_API void dist_pfm_free(dist_context *ctx, float *pixels, int width, int height, int channels)
+{
+    if (ctx && pixels) disti_free(ctx, pixels, (size_t)width * (size_t)height * (size_t)channels * sizeof(float));
+}
+
+#ifndef DIST_NO_STDIO
+DIST_API dist_status dist_pfm_save(dist_context *ctx, const char *path, int width, int height, int channels,
+                                   const float *pixels)
+{
+    size_t size = 0;
+    dist_status status = dist_pfm_write(ctx, width, height, channels, pixels, NULL, 0, &size);
+    if (status != DIST_OK) return status;
+    if (!path || !pixels)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_pfm_save: %s is NULL", path ? "pixels" : "path", 0, 0);
+    void *bytes = disti_alloc(ctx, size);
+    if (!bytes) return DIST_OUT_OF_MEMORY;
+    status = dist_pfm_write(ctx, width, height, channels, pixels, bytes, size, &size);
+    if (status == DIST_OK) status = disti_file_write(ctx, "dist_pfm_save", path, bytes, size);
+    disti_free(ctx, bytes, size);
+    return status;
+}
+
+DIST_API float *dist_pfm_load(dist_context *ctx, const char *path, int *width, int *height, int *channels)
+{
+    const char *name = "dist_pfm_load";
+    disti_pfm pfm;
+    float *pixels = NULL;
+    size_t size = 0;
+    if (disti_enter(ctx, name) != DIST_OK) return NULL;
+    if (!path || !width || !height || !channels) {
+        disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: path, width, height or channels is NULL", name, 0, 0);
+        return NULL;
+    }
+    unsigned char *bytes = disti_file_read(ctx, name, path, &size);
+    if (!bytes) return NULL;
+    if (disti_pfm_parse(ctx, path, bytes, size, &pfm) == DIST_OK)
+        pixels = (float *)disti_alloc(ctx, pfm.floats * sizeof(float)); /* fits: as many bytes are in the file */
+    if (pixels) {
+        disti_pfm_pixels(&pfm, pixels);
+        *width = pfm.width;
+        *height = pfm.height;
+        *channels = pfm.channels;
+    }
+    disti_free(ctx, bytes, size);
+    return pixels;
+}
+#endif
+
+#ifndef DIST_NO_MESH
+static int disti_is_blank(char c)
+{
+    return disti_is_space(c) && c != '\n';
+}
+
+static void disti_skip_blank(disti_text *t)
+{
+    while (t->at < t->end && disti_is_blank(*t->at)) t->at++;
+}
+
+static void disti_skip_line(disti_text *t)
+{
+    while (t->at < t->end && *t->at != '\n') t->at++;
+    if (t->at < t->end) t->at++;
+}
+
+/* Float to double and back by the bits: a program that flushes denormals would lose them. */
+static double disti_widen(uint32_t bits)
+{
+    float x;
+    memcpy(&x, &bits, sizeof x);
+    if (bits & 0x7f800000u) return (double)x;
+    double tiny = (double)(bits & 0x7fffffu) * 1.40129846432481707e-45;
+    return bits >> 31 ? -tiny : tiny;
+}
+
+static float disti_narrow(double x)
+{
+    const double largest = 340282346638528859811704183484516925440.0; /* nine digits of it are a little more */
+    uint64_t wide;
+    float result = (float)DISTI_MAX(DISTI_MIN(x, largest), -largest);
+    memcpy(&wide, &x, sizeof wide);
+    if (fabs(x) >= 1.17549435e-38) return result;
+    uint32_t bits = (uint32_t)(fabs(x) / 1.40129846432481707e-45 + 0.5) | (uint32_t)(wide >> 63 << 31);
+    memcpy(&result, &bits, sizeof result);
+    return result;
+}
+
+/* A mesh file while it is read. Counts in it are never believed: every vertex and corner is read before there is memory for
+   it, so that memory stays within a small multiple of the file. All functions return 1, or 0 after disti_fail. */
+typedef struct disti_mesh_text {
+    disti_text text;
+    const char *begin;
+    const char *label; /* what to call the file in a sentence */
+    dist_mesh *mesh;
+    unsigned first, last; /* corners of the polygon that is read: it is fanned from the first */
+} disti_mesh_text;
+
+/* format: %s the label, %d the byte where it happened, then number. */
+static int disti_mesh_fail(const disti_mesh_text *r, dist_status status, const char *format, double number)
+{
+    disti_fail(r->mesh->owner, status, format, r->label, (double)(r->text.at - r->begin), number);
+    return 0;
+}
+
+static int disti_mesh_read_vertex(disti_mesh_text *r, const double v[3])
+{
+    float p[3];
+    for (int k = 0; k < 3; k++) {
+        if (!disti_finite_double(v[k]) || fabs(v[k]) > 3.4028235e38)
+            return disti_mesh_fail(r, DIST_NOT_FINITE, "dist_mesh_read (%s): byte %d: vertex %d is not finite",
+                                   (double)r->mesh->vertex_count);
+        p[k] = disti_narrow(v[k]);
+    }
+    return disti_mesh_add_vertex(r->mesh, p);
+}
+
+/* Corner number k of a polygon. A polygon of one or two corners adds nothing. */
+static int disti_mesh_read_corner(disti_mesh_text *r, size_t k, double index)
+{
+    if (!(index >= 0.0 && index < 4294967295.0) || index != (double)(unsigned)index)
+        return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): byte %d: a face has vertex %d, which is out of range", index);
+    unsigned corner = (unsigned)index;
+    if (k == 0) r->first = corner;
+    if (k >= 2 && !disti_mesh_add_triangle(r->mesh, r->first, r->last, corner)) return 0;
+    r->last = corner;
+    return 1;
+}
+
+static int disti_read_obj(disti_mesh_text *r)
+{
+    disti_text *t = &r->text;
+    for (; t->at < t->end; disti_skip_line(t)) {
+        disti_skip_blank(t);
+        if (t->end - t->at < 2 || !disti_is_blank(t->at[1]) || (t->at[0] != 'v' && t->at[0] != 'f')) continue;
+        int face = *t->at++ == 'f';
+        double v[3];
+        for (int k = 0; !face && k < 3; k++) {
+            disti_skip_blank(t);
+            if (!disti_text_number(t, v + k))
+                return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): byte %d: a vertex must be three numbers", 0);
+        }
+        if (!face && !disti_mesh_read_vertex(r, v)) return 0;
+        for (size_t k = 0; face; k++) {
+            int64_t i = 0;
+            disti_skip_blank(t);
+            if (t->at == t->end || *t->at == '\n' || *t->at == '#') break;
+            if (!disti_text_integer(t, &i) || i == 0 || (t->at < t->end && *t->at != '/' && !disti_is_space(*t->at)))
+                return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): byte %d: not a corner of a face", 0);
+            while (t->at < t->end && !disti_is_space(*t->at)) t->at++; /* texture and normal */
+            if (!disti_mesh_read_corner(r, k, (double)(i > 0 ? i - 1 : i + (int64_t)r->mesh->vertex_count))) return 0;
+        }
+    }
+    if (r->mesh->vertex_count) return 1;
+    return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): neither PLY nor OFF nor an OBJ with vertices", 0);
+}
+
+/* The next number, over line ends and comments. */
+static int disti_off_number(disti_mesh_text *r, double *out)
+{
+    disti_text *t = &r->text;
+    for (disti_skip_space(t); t->at < t->end && *t->at == '#'; disti_skip_space(t)) disti_skip_line(t);
+    if (disti_text_number(t, out)) return 1;
+    return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): byte %d: truncated, or not a number", 0);
+}
+
+/* What follows the numbers on a line (normals, colors) is left out. */
+static int disti_read_off(disti_mesh_text *r)
+{
+    double counts[2], v[3], corners, index;
+    disti_skip_blank(&r->text);
+    if (r->text.end - r->text.at >= 6 && memcmp(r->text.at, "BINARY", 6) == 0)
+        return disti_mesh_fail(r, DIST_UNSUPPORTED, "dist_mesh_read (%s): binary OFF is not supported", 0);
+    if (!disti_off_number(r, counts) || !disti_off_number(r, counts + 1)) return 0;
+    disti_skip_line(&r->text);
+    for (double i = 0.0; i < counts[0]; i += 1.0) {
+        for (int k = 0; k < 3; k++)
+            if (!disti_off_number(r, v + k)) return 0;
+        if (!disti_mesh_read_vertex(r, v)) return 0;
+        disti_skip_line(&r->text);
+    }
+    for (double i = 0.0; i < counts[1]; i += 1.0) {
+        if (!disti_off_number(r, &corners)) return 0;
+        for (size_t k = 0; (double)k < corners; k++)
+            if (!disti_off_number(r, &index) || !disti_mesh_read_corner(r, k, index)) return 0;
+        disti_skip_line(&r->text);
+    }
+    return 1;
+}
+
+enum { DISTI_PLY_X = 0, DISTI_PLY_INDICES = 3, DISTI_PLY_OTHER = 4 };
+enum { DISTI_PLY_ELEMENTS = 16, DISTI_PLY_PROPERTIES = 128 };
+
+typedef struct disti_ply_property {
+    int type;       /* 0 int8, uint8, int16, uint16, int32, uint32, float32, 7 float64 */
+    int count_type; /* -1: not a list */
+    int role;       /* DISTI_PLY_X + axis, ... */
+} disti_ply_property;
+
+typedef struct disti_ply_element {
+    int64_t count;
+    int vertex, first, last; /* properties first..last-1 */
+} disti_ply_element;
+
+typedef struct disti_ply {
+    int ascii, element_count, property_count;
+    disti_ply_element elements[DISTI_PLY_ELEMENTS];
+    disti_ply_property properties[DISTI_PLY_PROPERTIES];
+} disti_ply;
+
+/* Steps over the word if it is the next one on the line. */
+static int disti_ply_word(disti_text *t, const char *word)
+{
+    size_t n = strlen(word);
+    disti_skip_blank(t);
+    if ((size_t)(t->end - t->at) <= n || memcmp(t->at, word, n) != 0 || !disti_is_space(t->at[n])) return 0;
+    t->at += n;
+    return 1;
+}
+
+static int disti_ply_type(disti_text *t)
+{
+    static const char *const names[16] = {"char", "int8", "uchar", "uint8", "short", "int16", "ushort", "uint16",
+                                          "int", "int32", "uint", "uint32", "float", "float32", "double", "float64"};
+    for (int i = 0; i < 16; i++)
+        if (disti_ply_word(t, names[i])) return i / 2;
+    return -1;
+}
+
+static int disti_ply_property_line(disti_mesh_text *r, disti_ply *ply)
+{
+    disti_text *t = &r->text;
+    if (ply->element_count == 0 || ply->property_count == DISTI_PLY_PROPERTIES)
+        return disti_mesh_fail(r, DIST_UNSUPPORTED, "dist_mesh_read (%s): byte %d: a PLY property without an element, or the 129th", 0);
+    disti_ply_element *element = ply->elements + ply->element_count - 1;
+    disti_ply_property *p = ply->properties + ply->property_count++;
+    int list = disti_ply_word(t, "list");
+    p->count_type = list ? disti_ply_type(t) : -1;
+    p->type = disti_ply_type(t);
+    p->role = DISTI_PLY_OTHER;
+    if (p->type < 0 || (list && (p->count_type < 0 || p->count_type > 5)))
+        return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): byte %d: not a type of a PLY property", 0);
+    const char *axes[3] = {"x", "y", "z"};
+    for (int k = 0; !list && element->vertex && k < 3; k++)
+        if (disti_ply_word(t, axes[k])) p->role = DISTI_PLY_X + k;
+    if (list && (disti_ply_word(t, "vertex_indices") || disti_ply_word(t, "vertex_index"))) p->role = DISTI_PLY_INDICES;
+    element->last = ply->property_count;
+    return 1;
+}
+
+static int disti_ply_element_line(disti_mesh_text *r, disti_ply *ply)
+{
+    disti_text *t = &r->text;
+    disti_ply_element *element = ply->elements + ply->element_count;
+    if (ply->element_count == DISTI_PLY_ELEMENTS)
+        return disti_mesh_fail(r, DIST_UNSUPPORTED, "dist_mesh_read (%s): byte %d: more than 16 PLY elements", 0);
+    ply->element_count++;
+    element->vertex = disti_ply_word(t, "vertex");
+    element->first = element->last = ply->property_count;
+    disti_skip_blank(t);
+    while (t->at < t->end && !element->vertex && !disti_is_space(*t->at)) t->at++;
+    disti_skip_blank(t);
+    if (disti_text_integer(t, &element->count) && element->count >= 0) return 1;
+    return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): byte %d: not the count of a PLY element", 0);
+}
+
+static int disti_ply_header(disti_mesh_text *r, disti_ply *ply)
+{
+    disti_text *t = &r->text;
+    memset(ply, 0, sizeof *ply);
+    for (disti_skip_line(t); t->at < t->end; disti_skip_line(t)) {
+        if (disti_ply_word(t, "end_header")) {
+            disti_skip_line(t);
+            return 1;
+        } else if (disti_ply_word(t, "format")) {
+            ply->ascii = disti_ply_word(t, "ascii");
+            if (!ply->ascii && !disti_ply_word(t, "binary_little_endian"))
+                return disti_mesh_fail(r, DIST_UNSUPPORTED, "dist_mesh_read (%s): byte %d: PLY must be ascii or binary_little_endian", 0);
+        } else if (disti_ply_word(t, "element")) {
+            if (!disti_ply_element_line(r, ply)) return 0;
+        } else if (disti_ply_word(t, "property")) {
+            if (!disti_ply_property_line(r, ply)) return 0;
+        }
+    }
+    return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): byte %d: the PLY header has no end", 0);
+}
+
+static int disti_ply_value(disti_mesh_text *r, const disti_ply *ply, int type, double *out)
+{
+    static const unsigned char sizes[8] = {1, 1, 2, 2, 4, 4, 4, 8};
+    disti_text *t = &r->text;
+    uint64_t bits = 0;
+    *out = 0.0;
+    if (ply->ascii) {
+        disti_skip_space(t);
+        if (disti_text_number(t, out) && (t->at == t->end || disti_is_space(*t->at))) return 1;
+        return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): byte %d: truncated, or not a finite number", 0);
+    }
+    if (t->end - t->at < sizes[type]) return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): truncated at byte %d", 0);
+    for (int i = 0; i < sizes[type]; i++) bits |= (uint64_t)(unsigned char)*t->at++ << 8 * i;
+    uint32_t low = (uint32_t)(bits & 0xffffffffu);
+    uint64_t sign = (uint64_t)1 << (8 * sizes[type] - 1);
+    if (type == 7) {
+        memcpy(out, &bits, sizeof bits);
+    } else if (type == 6) {
+        *out = disti_widen(low);
+    } else {
+        *out = (double)bits - ((type & 1) == 0 && (bits & sign) ? 2.0 * (double)sign : 0.0);
+    }
+    return 1;
+}
+
+/* A value nobody wants: in text it may be anything, such as nan. */
+static int disti_ply_skip(disti_mesh_text *r, const disti_ply *ply, int type)
+{
+    double ignored;
+    if (!ply->ascii) return disti_ply_value(r, ply, type, &ignored);
+    disti_skip_space(&r->text);
+    if (r->text.at == r->text.end) return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): truncated at byte %d", 0);
+    while (r->text.at < r->text.end && !disti_is_space(*r->text.at)) r->text.at++;
+    return 1;
+}
+
+/* One vertex, one face or one of what is left out. */
+static int disti_ply_item(disti_mesh_text *r, const disti_ply *ply, const disti_ply_element *element)
+{
+    double v[3], value, count;
+    for (int i = element->first; i < element->last; i++) {
+        const disti_ply_property *p = ply->properties + i;
+        if (p->count_type < 0) {
+            if (p->role > 2 ? !disti_ply_skip(r, ply, p->type) : !disti_ply_value(r, ply, p->type, v + p->role)) return 0;
+            continue;
+        }
+        if (!disti_ply_value(r, ply, p->count_type, &count)) return 0;
+        for (size_t k = 0; (double)k < count; k++) {
+            if (p->role != DISTI_PLY_INDICES) {
+                if (!disti_ply_skip(r, ply, p->type)) return 0;
+            } else if (!disti_ply_value(r, ply, p->type, &value) || !disti_mesh_read_corner(r, k, value)) {
+                return 0;
+            }
+        }
+    }
+    return element->vertex ? disti_mesh_read_vertex(r, v) : 1;
+}
+
+static int disti_read_ply(disti_mesh_text *r)
+{
+    disti_ply ply;
+    if (!disti_ply_header(r, &ply)) return 0;
+    for (int e = 0; e < ply.element_count; e++) {
+        const disti_ply_element *element = ply.elements + e;
+        int roles = 0;
+        for (int i = element->first; i < element->last; i++) roles |= 1 << ply.properties[i].role;
+        if (element->vertex && (roles & 7) != 7)
+            return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): the PLY vertices have no x, y and z", 0);
+        if (roles == 0) continue; /* no properties: no bytes, whatever the count says */
+        for (int64_t i = 0; i < element->count; i++)
+            if (!disti_ply_item(r, &ply, element)) return 0;
+    }
+    return 1;
+}
+
+static dist_mesh *disti_mesh_parse(dist_context *ctx, const char *label, const void *bytes, size_t size)
+{
+    disti_mesh_text r;
+    memset(&r, 0, sizeof r);
+    r.begin = r.text.at = (const char *)bytes;
+    r.text.end = r.begin + size;
+    r.label = label;
+    r.mesh = disti_mesh_new(ctx);
+    if (!r.mesh) return NULL;
+    int good;
+    if (size > 4 && memcmp(bytes, "ply", 3) == 0 && disti_is_space(r.begin[3])) {
+        good = disti_read_ply(&r);
+    } else {
+        size_t prefix = size > 4 && r.begin[0] == 'C' ? 1 : 0; /* C: colors, N: normals behind the coordinates */
+        prefix += size > 4 + prefix && r.begin[prefix] == 'N';
+        int off = size > 3 + prefix && memcmp(r.begin + prefix, "OFF", 3) == 0 && disti_is_space(r.begin[prefix + 3]);
+        if (off) r.text.at += prefix + 3;
+        good = off ? disti_read_off(&r) : disti_read_obj(&r);
+    }
+    for (size_t i = 0; good && i < 3 * r.mesh->triangle_count; i++)
+        if (r.mesh->triangles[i] >= r.mesh->vertex_count) {
+            disti_fail(ctx, DIST_BAD_FILE, "dist_mesh_read (%s): a face has vertex %d, must be below %d", label,
+                       (double)r.mesh->triangles[i], (double)r.mesh->vertex_count);
+            good = 0;
+        }
+    if (good) return r.mesh;
+    dist_mesh_destroy(r.mesh);
+    return NULL;
+}
+
+DIST_API dist_mesh *dist_mesh_read(dist_context *ctx, const void *bytes, size_t size)
+{
+    if (disti_enter(ctx, "dist_mesh_read") != DIST_OK) return NULL;
+    if (bytes) return disti_mesh_parse(ctx, "in memory", bytes, size);
+    disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_read: bytes is NULL", NULL, 0, 0);
+    return NULL;
+}
+
+/* Nine significant digits bring every float back; as printf's %.9g writes it, but in no locale. */
+static void disti_sink_decimal(disti_sink *sink, float number)
+{
+    char text[32], digits[9];
+    size_t n = 0;
+    int exponent = 0, last = 8;
+    uint32_t bits;
+    memcpy(&bits, &number, sizeof bits);
+    double x = disti_widen(bits & 0x7fffffffu);
+    if (bits >> 31) text[n++] = '-';
+    for (; x >= 10.0; exponent++) x /= 10.0;
+    for (; x > 0.0 && x < 1.0; exponent--) x *= 10.0;
+    uint64_t mantissa = (uint64_t)(x * 1e8 + 0.5);
+    if (mantissa >= 1000000000u) {
+        mantissa /= 10u;
+        exponent++;
+    }
+    for (int i = 8; i >= 0; i--, mantissa /= 10u) digits[i] = (char)('0' + (int)(mantissa % 10u));
+    while (last > 0 && digits[last] == '0') last--;
+    int plain = exponent > -5 && exponent < 9;
+    int point = plain ? exponent : 0; /* the digit after which the point stands */
+    if (point < 0) {
+        memcpy(text + n, "0.0000", 6);
+        n += (size_t)(1 - point);
+    }
+    for (int i = 0; i <= DISTI_MAX(last, point); i++) {
+        text[n++] = i <= last ? digits[i] : '0';
+        if (i == point && i < last) text[n++] = '.';
+    }
+    disti_sink_bytes(sink, text, n);
+    if (plain) return;
+    disti_sink_text(sink, exponent < 0 ? "e-" : "e");
+    disti_sink_integer(sink, (size_t)(exponent < 0 ? -exponent : exponent));
+}
+
+static void disti_write_ply(disti_sink *sink, const dist_mesh *mesh)
+{
+    disti_sink_text(sink, "ply\nformat binary_little_endian 1.0\nelement vertex ");
+    disti_sink_integer(sink, mesh->vertex_count);
+    disti_sink_text(sink, "\nproperty float x\nproperty float y\nproperty float z\n");
+    if (mesh->normals) disti_sink_text(sink, "property float nx\nproperty float ny\nproperty float nz\n");
+    disti_sink_text(sink, "element face ");
+    disti_sink_integer(sink, mesh->triangle_count);
+    /* some programs read only int; uint where it is needed */
+    disti_sink_text(sink, mesh->vertex_count > 0x7fffffffu ? "\nproperty list uchar uint" : "\nproperty list uchar int");
+    disti_sink_text(sink, " vertex_indices\nend_header\n");
+    for (size_t i = 0; i < mesh->vertex_count; i++) {
+        for (size_t k = 0; k < 3; k++) disti_sink_float(sink, mesh->vertices[3 * i + k]);
+        for (size_t k = 0; mesh->normals && k < 3; k++) disti_sink_float(sink, mesh->normals[3 * i + k]);
+    }
+    for (size_t i = 0; i < mesh->triangle_count; i++) {
+        disti_sink_bytes(sink, "\003", 1);
+        for (size_t k = 0; k < 3; k++) disti_sink_word(sink, mesh->triangles[3 * i + k]);
+    }
+}
+
+static void disti_write_obj_vectors(disti_sink *sink, const char *letter, size_t n, const float *vectors)
+{
+    for (size_t i = 0; i < n; i++) {
+        disti_sink_text(sink, letter);
+        for (size_t k = 0; k < 3; k++) {
+            disti_sink_text(sink, " ");
+            disti_sink_decimal(sink, vectors[3 * i + k]);
+        }
+        disti_sink_text(sink, "\n");
+    }
+}
+
+static void disti_write_obj(disti_sink *sink, const dist_mesh *mesh)
+{
+    disti_write_obj_vectors(sink, "v", mesh->vertex_count, mesh->vertices);
+    if (mesh->normals) disti_write_obj_vectors(sink, "vn", mesh->vertex_count, mesh->normals);
+    for (size_t i = 0; i < mesh->triangle_count; i++) {
+        disti_sink_text(sink, "f");
+        for (size_t k = 0; k < 3; k++) {
+            disti_sink_text(sink, " ");
+            disti_sink_integer(sink, (size_t)mesh->triangles[3 * i + k] + 1);
+            if (!mesh->normals) continue;
+            disti_sink_text(sink, "//");
+            disti_sink_integer(sink, (size_t)mesh->triangles[3 * i + k] + 1);
+        }
+        disti_sink_text(sink, "\n");
+    }
+}
+
+DIST_API dist_status dist_mesh_write(dist_context *ctx, const dist_mesh *mesh, int format, void *buffer, size_t capacity,
+                                     size_t *size)
+{
+    const char *name = "dist_mesh_write";
+    disti_sink sink;
+    dist_status status = disti_enter(ctx, name);
+    if (status != DIST_OK) return status;
+    if (!mesh || !size) return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_write: %s is NULL", mesh ? "size" : "mesh", 0, 0);
+    if (format != DIST_MESH_PLY && format != DIST_MESH_OBJ)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: format is %d, must be DIST_MESH_PLY or DIST_MESH_OBJ", name, format, 0);
+    for (size_t i = 0; i < mesh->vertex_count; i++)
+        if (!disti_finite_all(3, mesh->vertices + 3 * i) || (mesh->normals && !disti_finite_all(3, mesh->normals + 3 * i)))
+            return disti_fail(ctx, DIST_NOT_FINITE, "%s: vertex %d is not finite", name, (double)i, 0);
+    memset(&sink, 0, sizeof sink);
+    for (int pass = 0; pass < 2; pass++) { /* counts, then writes */
+        if (format == DIST_MESH_PLY) disti_write_ply(&sink, mesh);
+        else disti_write_obj(&sink, mesh);
+        *size = sink.size;
+        if (!buffer) return DIST_OK;
+        if (capacity < *size)
+            return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: capacity is %d, must be %d", name, (double)capacity, (double)*size);
+        sink.out = (unsigned char *)buffer;
+        sink.size = 0;
+    }
+    return DIST_OK;
+}
+
+#ifndef DIST_NO_STDIO
+DIST_API dist_mesh *dist_mesh_load(dist_context *ctx, const char *path)
+{
+    size_t size = 0;
+    if (disti_enter(ctx, "dist_mesh_load") != DIST_OK) return NULL;
+    if (!path) {
+        disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_load: path is NULL", NULL, 0, 0);
+        return NULL;
+    }
+    unsigned char *bytes = disti_file_read(ctx, "dist_mesh_load", path, &size);
+    if (!bytes) return NULL;
+    dist_mesh *mesh = disti_mesh_parse(ctx, path, bytes, size);
+    disti_free(ctx, bytes, size);
+    return mesh;
+}
+
+DIST_API dist_status dist_mesh_save(dist_context *ctx, const dist_mesh *mesh, const char *path)
+{
+    size_t size = 0, n = path ? strlen(path) : 0;
+    dist_status status = disti_enter(ctx, "dist_mesh_save");
+    if (status != DIST_OK) return status;
+    if (!mesh || !path) return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_save: %s is NULL", mesh ? "path" : "mesh", 0, 0);
+    int ply = n >= 4 && (memcmp(path + n - 4, ".ply", 4) == 0 || memcmp(path + n - 4, ".PLY", 4) == 0);
+    int obj = n >= 4 && (memcmp(path + n - 4, ".obj", 4) == 0 || memcmp(path + n - 4, ".OBJ", 4) == 0);
+    if (!ply && !obj) return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_save: %s: must end in .ply or .obj", path, 0, 0);
+    int format = ply ? DIST_MESH_PLY : DIST_MESH_OBJ;
+    status = dist_mesh_write(ctx, mesh, format, NULL, 0, &size);
+    if (status != DIST_OK) return status;
+    void *bytes = disti_alloc(ctx, size);
+    if (!bytes) return DIST_OUT_OF_MEMORY;
+    status = dist_mesh_write(ctx, mesh, format, bytes, size, &size);
+    if (status == DIST_OK) status = disti_file_write(ctx, "dist_mesh_save", path, bytes, size);
+    disti_free(ctx, bytes, size);
+    return status;
+}
+#endif
+#endif
+
+#undef DISTI_RESTRICT
+#undef DISTI_TARGET
+#undef DISTI_UNUSED
+#undef DISTI_KERNEL
+#undef DISTI_X86
+#undef DISTI_NEON
+#undef DISTI_OPENMP
+#undef DISTI_ALIGNMENT
+#undef DISTI_MIN
+#undef DISTI_MAX
+#undef DISTI_ANALYTIC
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif /* DIST_IMPLEMENTED */
+#endif /* DIST_IMPLEMENTATION */
+
+/* MIT No Attribution
+
+   Copyright (c) The dist.h authors
+
+   Permission is hereby granted, free of charge, to any person obtaining a copy of this software and associated documentation
+   files (the "Software"), to deal in the Software without restriction, including without limitation the rights to use, copy,
+   modify, merge, publish, distribute, sublicense, and/or sell copies of the Software, and to permit persons to whom the
+   Software is furnished to do so.
+
+   THE SOFTWARE IS PROVIDED "AS IS", WITHOUT WARRANTY OF ANY KIND, EXPRESS OR IMPLIED, INCLUDING BUT NOT LIMITED TO THE
+   WARRANTIES OF MERCHANTABILITY, FITNESS FOR A PARTICULAR PURPOSE AND NONINFRINGEMENT. IN NO EVENT SHALL THE AUTHORS OR
+   COPYRIGHT HOLDERS BE LIABLE FOR ANY CLAIM, DAMAGES OR OTHER LIABILITY, WHETHER IN AN ACTION OF CONTRACT, TORT OR
+   OTHERWISE, ARISING FROM, OUT OF OR IN CONNECTION WITH THE SOFTWARE OR THE USE OR OTHER DEALINGS IN THE SOFTWARE. */

@@ -3,8 +3,8 @@
 
    What it is: a trained decoder f(p, z) -> signed distance goes in; depth, normals, silhouette and mask from any camera
    come out; and a loss on those images goes back, by a hand-derived adjoint, to the code z, the camera and the weights.
-   The method is Liu et al., "DIST: Rendering Deep Implicit Signed Distance Function with Differentiable Sphere Tracing",
-   CVPR 2020; "the paper" below. One file, C99 and C++11, no dependency, no build flag.
+   The method is Liu et al., "DIST: Rendering Deep Implicit Signed Distance Function with Differentiable Sphere
+   Tracing", CVPR 2020; "the paper" below. One file, C99 and C++11, no dependency, no build flag.
 
    What it does not: no GPU, no window, no general automatic differentiation, no path tracing; no 16-bit images.
 
@@ -72,7 +72,7 @@
 extern "C" {
 #endif
 
-/* ---- 01 config, status, hooks ---------------------------------------------------------------------------------------- */
+/* ---- 01 config, status, hooks ------------------------------------------------------------------------------------ */
 
 typedef int dist_status;
 enum {
@@ -107,12 +107,13 @@ typedef struct dist_scheduler {
 } dist_scheduler;
 
 /* Matrix product of the user's BLAS: C (m, n) = alpha op(A) op(B) + beta C, all row-major, op(X) = X or its transpose;
-   lda, ldb, ldc are row strides in floats. Tried on a small product when the context is made; a wrong answer is refused.
-   It may be called from several workers at once. Used for layers at least dist_context_desc.blas_width wide. */
+   lda, ldb, ldc are row strides in floats. Tried on a small product when the context is made; a wrong answer is
+   refused. It may be called from several workers at once. Used for layers at least dist_context_desc.blas_width
+      wide. */
 typedef struct dist_blas {
     void *user;
-    void (*sgemm_fn)(void *user, int transpose_a, int transpose_b, int m, int n, int k, float alpha, const float *a, int lda,
-                     const float *b, int ldb, float beta, float *c, int ldc);
+    void (*sgemm_fn)(void *user, int transpose_a, int transpose_b, int m, int n, int k, float alpha, const float *a,
+                     int lda, const float *b, int ldb, float beta, float *c, int ldc);
 } dist_blas;
 
 /* Told every failure as it happens, with the sentence that dist_context_message keeps only for the first. */
@@ -121,7 +122,7 @@ typedef struct dist_logger {
     void (*log_fn)(void *user, dist_status status, const char *message);
 } dist_logger;
 
-/* ---- 02 context ------------------------------------------------------------------------------------------------------- */
+/* ---- 02 context -------------------------------------------------------------------------------------------------- */
 
 /* Hooks in force, processor features, scratch memory, and the first failure with its sentence.
    One context serves one thread at a time; contexts are independent of each other. */
@@ -138,7 +139,7 @@ enum {
 
 typedef struct dist_context_desc {
     int workers; /* threads to use at most; 0: as many as OpenMP would, 1 without OpenMP. Required with a scheduler */
-    int isa;     /* DIST_ISA_*; one that the processor lacks is refused. Bits are the same on all machines for one isa */
+    int isa; /* DIST_ISA_*; one that the processor lacks is refused. Bits are the same on all machines for one isa */
     dist_allocator allocator;
     dist_scheduler scheduler;
     dist_blas blas;
@@ -146,8 +147,8 @@ typedef struct dist_context_desc {
     int blas_width; /* 0: 128 */
 } dist_context_desc;
 
-/* desc may be NULL. Returns NULL only if memory cannot be had; any other failure (a refused hook) comes back as a context
-   whose status says so and with which every further call fails with that status. */
+/* desc may be NULL. Returns NULL only if memory cannot be had; any other failure (a refused hook) comes back as a
+   context whose status says so and with which every further call fails with that status. */
 DIST_API dist_context *dist_context_create(const dist_context_desc *desc);
 DIST_API void dist_context_destroy(dist_context *ctx);
 
@@ -161,7 +162,7 @@ DIST_API int dist_context_isa(const dist_context *ctx);
 DIST_API const char *dist_isa_name(int isa);
 DIST_API int dist_context_workers(const dist_context *ctx);
 
-/* ---- 04 field --------------------------------------------------------------------------------------------------------- */
+/* ---- 04 field ---------------------------------------------------------------------------------------------------- */
 
 /* What is traced: a function of the point that is negative inside, positive outside, zero on the surface, within a
    bounding sphere. Yours, an analytic one below, or a network (dist_shape_field). A plain value: copy it freely.
@@ -173,10 +174,11 @@ typedef struct dist_field {
     void (*eval_fn)(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient);
     /* d_code[j] += sum over i of d_sdf[i] * df(points[i])/dcode[j]. NULL: this field has no code. */
     void (*adjoint_fn)(void *user, int worker, size_t n, const float *points, const float *d_sdf, double *d_code);
-    /* Set by dist_shape_field, NULL in a field of your own: value, gradient and code adjoint in one pass, and the weights'. */
+    /* Set by dist_shape_field, NULL in a field of your own: value, gradient and code adjoint in one pass, and the
+       weights'. */
     void (*fused_fn)(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient,
-                     void (*seed_fn)(void *seed_user, size_t first, size_t count, const float *sdf, const float *gradient,
-                                     float *d_sdf),
+                     void (*seed_fn)(void *seed_user, size_t first, size_t count, const float *sdf,
+                                     const float *gradient, float *d_sdf),
                      void *seed_user, double *d_code);
     dist_status (*weights_fn)(void *user, dist_context *ctx, size_t n, const float *points, float *d_sdf,
                               void (*seed_fn)(void *seed_user, size_t first, size_t count, const float *sdf,
@@ -201,8 +203,9 @@ DIST_API dist_field dist_field_torus(const float center_radii[5]); /* x y z, rin
 DIST_API dist_field dist_field_box(const float center_half[6]);    /* x y z, half extents */
 
 /* Values and, unless NULL, gradients of any field at n points. */
-DIST_API dist_status dist_field_eval(dist_context *ctx, const dist_field *field, size_t n, const float *points /* (n,3) */,
-                                     float *sdf /* (n) */, float *gradient /* (n,3) or NULL */);
+DIST_API dist_status dist_field_eval(dist_context *ctx, const dist_field *field, size_t n,
+                                     const float *points /* (n,3) */, float *sdf /* (n) */,
+                                     float *gradient /* (n,3) or NULL */);
 
 #ifndef DIST_NO_BACKWARD
 /* Where gradients go; NULL is not wanted and costs nothing. All are added to.
@@ -214,8 +217,8 @@ typedef struct dist_gradients {
     float *weights;     /* (field.weight_count), the order of dist_net_weights */
 } dist_gradients;
 
-/* Tells d_sdf (count) for points first..first+count-1 once their sdf (count) and gradient (count, 3) are known; gradient
-   is NULL where grads->weights is wanted. Called from several workers at once. */
+/* Tells d_sdf (count) for points first..first+count-1 once their sdf (count) and gradient (count, 3) are known;
+   gradient is NULL where grads->weights is wanted. Called from several workers at once. */
 typedef void (*dist_seed_fn)(void *seed_user, size_t first, size_t count, const float *sdf, const float *gradient,
                              float *d_sdf);
 
@@ -228,7 +231,7 @@ DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *fi
                                          const dist_gradients *grads);
 #endif
 
-/* ---- 05 net ----------------------------------------------------------------------------------------------------------- */
+/* ---- 05 net ------------------------------------------------------------------------------------------------------ */
 
 /* Weights of a decoder: read-only after creation, shared by any number of shapes and contexts. */
 typedef struct dist_net dist_net;
@@ -244,16 +247,17 @@ enum {
     DIST_ACTIVATION_NONE
 };
 
-/* Reads a model in safetensors form; tensor names and metadata as the README's "Model files" says. The bytes are copied.
-   A file is hostile until proved otherwise: NULL and a sentence for anything that does not fit. */
+/* Reads a model in safetensors form; tensor names and metadata as the README's "Model files" says. The bytes are
+   copied. A file is hostile until proved otherwise: NULL and a sentence for anything that does not fit. */
 DIST_API dist_net *dist_net_load(dist_context *ctx, const void *bytes, size_t size);
 #ifndef DIST_NO_STDIO
 DIST_API dist_net *dist_net_load_file(dist_context *ctx, const char *path);
 DIST_API dist_status dist_net_save_file(dist_context *ctx, const dist_net *net, const char *path);
 #endif
 DIST_API void dist_net_destroy(dist_net *net);
-/* Writes what dist_net_load reads; the same net gives the same bytes. *size is set to the bytes needed; with buffer NULL
-   nothing else happens; too small a capacity is refused. Weight norm is folded: plain weights are written, in F32. */
+/* Writes what dist_net_load reads; the same net gives the same bytes. *size is set to the bytes needed; with buffer
+   NULL nothing else happens; too small a capacity is refused. Weight norm is folded: plain weights are written, in
+      F32. */
 DIST_API dist_status dist_net_save(dist_context *ctx, const dist_net *net, void *buffer, size_t capacity, size_t *size);
 
 DIST_API int dist_net_code_size(const dist_net *net);  /* 0: no code */
@@ -264,7 +268,8 @@ DIST_API float dist_net_bound(const dist_net *net);    /* radius of the sphere t
 /* Multiply-adds of one query with the code folded, and without folding. */
 DIST_API size_t dist_net_operations(const dist_net *net, int folded);
 
-/* All trainable numbers: for each layer its weight (out, in) as in the file, its bias (out), its norm's weight and bias. */
+/* All trainable numbers: for each layer its weight (out, in) as in the file, its bias (out), its norm's weight and
+   bias. */
 DIST_API size_t dist_net_weight_count(const dist_net *net);
 DIST_API const float *dist_net_weights(const dist_net *net);
 
@@ -279,14 +284,14 @@ typedef struct dist_net_desc {
     int activation;   /* DIST_ACTIVATION_* */
     float scale;      /* beta of softplus, omega of sine; 0: 100, 30 */
     int output_linear;/* 0: tanh at the end, 1: nothing */
-    int geometric;    /* 1: starts near the distance to a sphere of half the bound (ReLU, softplus); 0: PyTorch's start */
+    int geometric; /* 1: starts near the distance to a sphere of half the bound (ReLU, softplus); 0: PyTorch's start */
     float bound;      /* 0: 1 */
     float clamp;      /* 0: 0.1 with a code, none without */
     unsigned seed;
 } dist_net_desc;
 DIST_API dist_net *dist_net_create(dist_context *ctx, const dist_net_desc *desc);
-/* Replace all weights (dist_net_weight_count) or one stored code. The caller sees to it that no shape is in use by another
-   thread; shapes of this net see the change at their next dist_shape_set_code. */
+/* Replace all weights (dist_net_weight_count) or one stored code. The caller sees to it that no shape is in use by
+   another thread; shapes of this net see the change at their next dist_shape_set_code. */
 DIST_API dist_status dist_net_set_weights(dist_context *ctx, dist_net *net, const float *weights);
 DIST_API dist_status dist_net_set_code(dist_context *ctx, dist_net *net, int index, const float *code);
 #endif
@@ -295,12 +300,14 @@ DIST_API dist_status dist_net_set_code(dist_context *ctx, dist_net *net, int ind
 DIST_API dist_shape *dist_shape_create(dist_context *ctx, const dist_net *net, const float *code);
 DIST_API void dist_shape_destroy(dist_shape *shape);
 DIST_API dist_status dist_shape_set_code(dist_shape *shape, const float *code);
-/* The field of the net's distance channel. Borrows the shape. A net without one (r,g,b) gives a field that render refuses. */
+/* The field of the net's distance channel. Borrows the shape. A net without one (r,g,b) gives a field that render
+   refuses. */
 DIST_API dist_field dist_shape_field(dist_shape *shape);
 /* All output channels (n, dist_net_channels) at n points. */
-DIST_API dist_status dist_shape_eval(dist_context *ctx, dist_shape *shape, size_t n, const float *points, float *channels);
+DIST_API dist_status dist_shape_eval(dist_context *ctx, dist_shape *shape, size_t n, const float *points,
+                                     float *channels);
 
-/* ---- 06 camera -------------------------------------------------------------------------------------------------------- */
+/* ---- 06 camera --------------------------------------------------------------------------------------------------- */
 
 /* Pinhole camera. A world point x is seen at x_cam = rotation x + translation (row-major, x right, y down, z forward),
    pixel u = fx X/Z + skew Y/Z + cx, v = fy Y/Z + cy. */
@@ -313,8 +320,8 @@ typedef struct dist_camera {
 } dist_camera;
 
 /* fx = fy = height / 2 / tan(fov_y / 2), cx = (width - 1) / 2, cy = (height - 1) / 2, pixel centers at integers.
-   Degenerate input (eye = at, up along the view) is repaired by choosing another up; what cannot be repaired is refused by
-   the function that takes the camera. */
+   Degenerate input (eye = at, up along the view) is repaired by choosing another up; what cannot be repaired is
+   refused by the function that takes the camera. */
 DIST_API dist_camera dist_camera_look_at(int width, int height, float fov_y /* radians */, const float eye[3],
                                          const float at[3], const float up[3]);
 /* camera_to_world: row-major 3 x 4 or the upper part of 4 x 4, x right, y up, z backward (OpenGL, Blender, NeRF). */
@@ -329,7 +336,7 @@ DIST_API void dist_camera_move(dist_camera *camera, const float w[3], const floa
 /* Center of projection -R^T t and unit direction of pixel (x, y), in world coordinates. */
 DIST_API void dist_camera_ray(const dist_camera *camera, float x, float y, float origin[3], float direction[3]);
 
-/* ---- 07 trace --------------------------------------------------------------------------------------------------------- */
+/* ---- 07 trace ---------------------------------------------------------------------------------------------------- */
 
 enum { DIST_TRACE_GUARDED = 0, DIST_TRACE_PAPER = 1 };
 enum { DIST_PAPER_COARSE_TO_FINE = 0, DIST_PAPER_AGGRESSIVE, DIST_PAPER_DYNAMIC, DIST_PAPER_PARALLEL };
@@ -350,7 +357,7 @@ enum {
 typedef struct dist_render_desc {
     int max_steps;       /* queries per ray at most; 0: 100 guarded, 50 paper */
     float step_scale;    /* alpha; 0: 1.5 (paper: rows aggressive and coarse-to-fine). Above 0 */
-    float epsilon;       /* largest |f| of a hit, shape units; 0: 5e-5, or less where a pixel is smaller (see the README) */
+    float epsilon; /* largest |f| of a hit, shape units; 0: 5e-5, or less where a pixel is smaller (see the README) */
     int samples;         /* K of the paper's gradient, 1 to 8; 0: 1 */
     int trace;           /* DIST_TRACE_* */
     int paper_row;       /* DIST_PAPER_* */
@@ -373,12 +380,13 @@ typedef struct dist_stats {
     unsigned long long rays;            /* asked for */
     unsigned long long rays_in_sphere;  /* of them, those that meet the bounding sphere */
     unsigned long long queries;         /* points at which f was evaluated, everything included */
-    unsigned long long cone_queries, march_queries, refine_queries, silhouette_queries, normal_queries; /* their parts */
+    unsigned long long cone_queries, march_queries, refine_queries, silhouette_queries,
+        normal_queries; /* their parts */
     unsigned long long hits, unresolved, inside, plateau, not_finite;
     unsigned long long capped;          /* backward: rays whose grad f . v was capped */
     unsigned long long backward_points; /* backward: points through the adjoint */
     unsigned long long skipped;         /* backward: pixels with a zero upstream gradient */
-    double operations;                  /* multiply-adds a dense net would have done for the queries; 0 if the field is not a net */
+    double operations; /* multiply-adds a dense net would have done for the queries; 0 if the field is not a net */
     double operations_done;             /* of them, those not left out as dead units */
     float epsilon;                      /* the |f| in force, smallest over the picture */
     float lipschitz;                    /* in force */
@@ -396,12 +404,13 @@ typedef struct dist_hit {
 /* Traces n rays (origins (n, 3), directions (n, 3) of any nonzero length) with the guarded tracer: picking, shadows,
    collision. The first surface in front of each origin. */
 DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size_t n, const float *origins,
-                                const float *directions, const dist_render_desc *how, dist_hit *hits, dist_stats *stats);
+                                const float *directions, const dist_render_desc *how, dist_hit *hits,
+                                dist_stats *stats);
 
-/* ---- 08 render -------------------------------------------------------------------------------------------------------- */
+/* ---- 08 render --------------------------------------------------------------------------------------------------- */
 
-/* Planes of width * height entries, top row first; NULL: not computed. As d_out of dist_render_backward the float planes
-   hold dL/d(plane) and are only read. */
+/* Planes of width * height entries, top row first; NULL: not computed. As d_out of dist_render_backward the float
+   planes hold dL/d(plane) and are only read. */
 typedef struct dist_images {
     float *depth;          /* z in camera space */
     float *distance;       /* along the ray */
@@ -433,28 +442,28 @@ DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *ta
                                           const dist_gradients *grads);
 #endif
 
-/* ---- 09 loss ---------------------------------------------------------------------------------------------------------- */
+/* ---- 09 loss ----------------------------------------------------------------------------------------------------- */
 
 /* Each returns weight * loss and adds its gradient to the d_ array unless that is NULL. n: pixels. Means are over the
    pixels that count; none: 0 and no gradient. Sums are kept in double.
    A target counts where it is finite and 0 < target < 1e5; mask may be NULL: then every pixel is a hit. */
 
 /* mean |depth - target| over hit, observed pixels */
-DIST_API float dist_loss_depth(size_t n, const float *depth, const float *target, const unsigned char *mask, float weight,
-                               float *d_depth);
+DIST_API float dist_loss_depth(size_t n, const float *depth, const float *target, const unsigned char *mask,
+                               float weight, float *d_depth);
 /* mean -(normal . target) over hit pixels whose target normal (n, 3) is finite and not 0; the target is normalized */
-DIST_API float dist_loss_normal(size_t n, const float *normal, const float *target, const unsigned char *mask, float weight,
-                                float *d_normal);
-/* mean over all pixels of S_gt max(0, S) + (1 - S_gt) max(0, -S); S_gt = target[i] != 0                       (paper, eq. 8) */
+DIST_API float dist_loss_normal(size_t n, const float *normal, const float *target, const unsigned char *mask,
+                                float weight, float *d_normal);
+/* mean over all pixels of S_gt max(0, S) + (1 - S_gt) max(0, -S); S_gt = target[i] != 0              (paper, eq. 8) */
 DIST_API float dist_loss_silhouette(size_t n, const float *silhouette, const unsigned char *target, float weight,
                                     float *d_silhouette);
 /* mean |color - target| over hit pixels and channels */
-DIST_API float dist_loss_color(size_t n, const float *color, const float *target, const unsigned char *mask, float weight,
-                               float *d_color);
+DIST_API float dist_loss_color(size_t n, const float *color, const float *target, const unsigned char *mask,
+                               float weight, float *d_color);
 /* |code|^2; n: its length */
 DIST_API float dist_loss_code(size_t n, const float *code, float weight, float *d_code);
 
-/* ---- 10 optimizer ----------------------------------------------------------------------------------------------------- */
+/* ---- 10 optimizer ------------------------------------------------------------------------------------------------ */
 
 #ifndef DIST_NO_BACKWARD
 /* Adam. moments (2 n floats) is the caller's, zeroed before the first step. Zero fields mean the defaults. */
@@ -471,7 +480,7 @@ typedef struct dist_adam {
 DIST_API size_t dist_adam_step(dist_adam *adam, size_t n, float *x, const float *gradient);
 #endif
 
-/* ---- 11 mesh, metrics ------------------------------------------------------------------------------------------------- */
+/* ---- 11 mesh, metrics -------------------------------------------------------------------------------------------- */
 
 #ifndef DIST_NO_MESH
 /* Triangles, counterclockwise seen from outside. Made by the functions below, ended by dist_mesh_destroy. */
@@ -497,12 +506,12 @@ typedef struct dist_mesh_desc {
    mesh of no triangles, not an error. NULL on failure. */
 DIST_API dist_mesh *dist_mesh_extract(dist_context *ctx, const dist_field *field, const dist_mesh_desc *desc);
 /* Copies the arrays; an index out of range or a vertex that is not finite is refused. */
-DIST_API dist_mesh *dist_mesh_create(dist_context *ctx, size_t vertex_count, const float *vertices, size_t triangle_count,
-                                     const unsigned *triangles);
+DIST_API dist_mesh *dist_mesh_create(dist_context *ctx, size_t vertex_count, const float *vertices,
+                                     size_t triangle_count, const unsigned *triangles);
 DIST_API void dist_mesh_destroy(dist_mesh *mesh);
 #ifndef DIST_NO_BACKWARD
-/* Adjoint of extraction: a vertex moves by dv = -n df / |grad f|, so d_vertices (vertex_count, 3) reaches the field's code
-   and weights. grads->rotation and ->translation must be NULL. */
+/* Adjoint of extraction: a vertex moves by dv = -n df / |grad f|, so d_vertices (vertex_count, 3) reaches the
+   field's code and weights. grads->rotation and ->translation must be NULL. */
 DIST_API dist_status dist_mesh_backward(dist_context *ctx, const dist_field *field, const dist_mesh *mesh,
                                         const float *d_vertices, const dist_gradients *grads);
 #endif
@@ -510,21 +519,21 @@ DIST_API dist_status dist_mesh_backward(dist_context *ctx, const dist_field *fie
 /* n points (n, 3), uniform over the area, the same for the same seed. An empty mesh is refused. */
 DIST_API dist_status dist_mesh_sample(dist_context *ctx, const dist_mesh *mesh, unsigned seed, size_t n, float *points);
 
-/* Chamfer distance as DeepSDF defines it: mean over a of squared distance to the nearest of b, plus the same the other way.
-   a (n, 3), b (m, 3). one_way[0], [1] get the two parts unless NULL. Allocates. */
-DIST_API dist_status dist_chamfer(dist_context *ctx, size_t n, const float *a, size_t m, const float *b, double *chamfer,
-                                  double one_way[2]);
+/* Chamfer distance as DeepSDF defines it: mean over a of squared distance to the nearest of b, plus the same the
+   other way. a (n, 3), b (m, 3). one_way[0], [1] get the two parts unless NULL. Allocates. */
+DIST_API dist_status dist_chamfer(dist_context *ctx, size_t n, const float *a, size_t m, const float *b,
+                                  double *chamfer, double one_way[2]);
 #endif
 
-/* ---- 12 files --------------------------------------------------------------------------------------------------------- */
+/* ---- 12 files ---------------------------------------------------------------------------------------------------- */
 
 /* PFM: channels 1 or 3, little-endian, bottom row first in the file, top row first in memory. */
 /* *size gets the bytes needed; buffer NULL: only that. */
-DIST_API dist_status dist_pfm_write(dist_context *ctx, int width, int height, int channels, const float *pixels, void *buffer,
-                                    size_t capacity, size_t *size);
+DIST_API dist_status dist_pfm_write(dist_context *ctx, int width, int height, int channels, const float *pixels,
+                                    void *buffer, size_t capacity, size_t *size);
 /* Reads the header; then, pixels not NULL, the picture into it (capacity in floats). Either byte order. */
-DIST_API dist_status dist_pfm_read(dist_context *ctx, const void *bytes, size_t size, int *width, int *height, int *channels,
-                                   float *pixels, size_t capacity);
+DIST_API dist_status dist_pfm_read(dist_context *ctx, const void *bytes, size_t size, int *width, int *height,
+                                   int *channels, float *pixels, size_t capacity);
 #ifndef DIST_NO_STDIO
 DIST_API dist_status dist_pfm_save(dist_context *ctx, const char *path, int width, int height, int channels,
                                    const float *pixels);
@@ -534,12 +543,12 @@ DIST_API float *dist_pfm_load(dist_context *ctx, const char *path, int *width, i
 DIST_API void dist_pfm_free(dist_context *ctx, float *pixels, int width, int height, int channels);
 
 #ifndef DIST_NO_MESH
-/* Mesh files in memory. read: PLY (ascii, binary little-endian; triangles and polygons), OBJ (v, f; polygons fanned), OFF;
-   told apart by their first bytes. write: PLY binary, or OBJ. */
+/* Mesh files in memory. read: PLY (ascii, binary little-endian; triangles and polygons), OBJ (v, f; polygons
+   fanned), OFF; told apart by their first bytes. write: PLY binary, or OBJ. */
 enum { DIST_MESH_PLY = 0, DIST_MESH_OBJ = 1 };
 DIST_API dist_mesh *dist_mesh_read(dist_context *ctx, const void *bytes, size_t size);
-DIST_API dist_status dist_mesh_write(dist_context *ctx, const dist_mesh *mesh, int format, void *buffer, size_t capacity,
-                                     size_t *size);
+DIST_API dist_status dist_mesh_write(dist_context *ctx, const dist_mesh *mesh, int format, void *buffer,
+                                     size_t capacity, size_t *size);
 #ifndef DIST_NO_STDIO
 DIST_API dist_mesh *dist_mesh_load(dist_context *ctx, const char *path);
 /* By the name's ending: .ply or .obj. */
@@ -553,9 +562,9 @@ DIST_API dist_status dist_mesh_save(dist_context *ctx, const dist_mesh *mesh, co
 
 #endif /* DIST_H */
 
-/* ======================================================================================================================== */
-/* End of the interface. You can stop reading here.                                                                         */
-/* ======================================================================================================================== */
+/* ================================================================================================================== */
+/* End of the interface. You can stop reading here.                                                                   */
+/* ================================================================================================================== */
 
 #ifdef DIST_IMPLEMENTATION
 #ifndef DIST_IMPLEMENTED
@@ -573,7 +582,7 @@ DIST_API dist_status dist_mesh_save(dist_context *ctx, const dist_mesh *mesh, co
 extern "C" {
 #endif
 
-/*@ 01 config, status, hooks ----------------------------------------------------------------------------------------------- */
+/*@ 01 config, status, hooks ---------------------------------------------------------------------------------------- */
 
 #ifndef DIST_ASSERT
 #define DIST_ASSERT(x) ((void)0)
@@ -599,7 +608,8 @@ extern "C" {
 #define DISTI_KERNEL
 #endif
 
-#if !defined(DIST_NO_SIMD) && (defined(__x86_64__) || defined(_M_X64)) && (defined(__GNUC__) || defined(__clang__) || defined(_MSC_VER))
+#if !defined(DIST_NO_SIMD) && (defined(__x86_64__) || defined(_M_X64)) &&                                              \
+    (defined(__GNUC__) || defined(__clang__) || defined(_MSC_VER))
 #define DISTI_X86
 #include <immintrin.h>
 #ifdef _MSC_VER
@@ -689,7 +699,7 @@ static void disti_libc_free(void *user, void *pointer, size_t bytes)
 }
 #endif
 
-/*@ 02 context ------------------------------------------------------------------------------------------------------------- */
+/*@ 02 context ------------------------------------------------------------------------------------------------------ */
 
 struct dist_context {
     dist_allocator allocator;
@@ -708,7 +718,11 @@ struct dist_context {
 };
 
 /* Each worker's scratch: counters, then the tracer's part, then the field's. */
-enum { DISTI_COUNTER_BYTES = 64, DISTI_TRACE_BYTES = 704 * 1024, DISTI_FIELD_OFFSET = DISTI_COUNTER_BYTES + DISTI_TRACE_BYTES };
+enum {
+    DISTI_COUNTER_BYTES = 64,
+    DISTI_TRACE_BYTES = 704 * 1024,
+    DISTI_FIELD_OFFSET = DISTI_COUNTER_BYTES + DISTI_TRACE_BYTES
+};
 /* Sums that must not depend on the number of threads are kept in this many slots. */
 enum { DISTI_SLOTS = 32 };
 
@@ -773,9 +787,10 @@ static size_t disti_format_number(char *out, double x, int digits)
     return n;
 }
 
-/* Keeps the sentence of the first failure and returns status. In format %s stands for text, the first and second %d for a
-   and b; what is too long is cut. Unprintable bytes of text become '?': it may come out of a hostile file. */
-static dist_status disti_fail(dist_context *ctx, dist_status status, const char *format, const char *text, double a, double b)
+/* Keeps the sentence of the first failure and returns status. In format %s stands for text, the first and second %d
+   for a and b; what is too long is cut. Unprintable bytes of text become '?': it may come out of a hostile file. */
+static dist_status disti_fail(dist_context *ctx, dist_status status, const char *format, const char *text, double a,
+                              double b)
 {
     if (!ctx) return status;
     char message[sizeof ctx->message];
@@ -1030,7 +1045,8 @@ static dist_status disti_partial_reserve(dist_context *ctx, size_t size)
     return DIST_OK;
 }
 
-/* C (3, 4) = 2 A B + 3 C in all four transpositions, against plain loops; small integers, so every right BLAS is exact. */
+/* C (3, 4) = 2 A B + 3 C in all four transpositions, against plain loops; small integers, so every right BLAS is
+   exact. */
 static int disti_blas_works(const dist_blas *blas)
 {
     for (int mode = 0; mode < 4; mode++) {
@@ -1044,7 +1060,8 @@ static int disti_blas_works(const dist_blas *blas)
         for (int i = 0; i < 3; i++) {
             for (int j = 0; j < 4; j++) {
                 float sum = 0.0f;
-                for (int k = 0; k < 5; k++) sum += (ta ? a[k * 7 + i] : a[i * 7 + k]) * (tb ? b[j * 7 + k] : b[k * 7 + j]);
+                for (int k = 0; k < 5; k++)
+                    sum += (ta ? a[k * 7 + i] : a[i * 7 + k]) * (tb ? b[j * 7 + k] : b[k * 7 + j]);
                 expected[i * 6 + j] = 2.0f * sum + 3.0f * expected[i * 6 + j];
             }
         }
@@ -1068,11 +1085,13 @@ static dist_status disti_context_check(dist_context *ctx, const dist_context_des
     if (desc->scheduler.run_fn && desc->workers == 0)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: workers is 0, must be told with a scheduler", name, 0, 0);
     if (desc->blas_width < 0)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: blas_width is %d, must not be negative", name, desc->blas_width, 0);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: blas_width is %d, must not be negative", name, desc->blas_width,
+                          0);
     if (desc->blas.sgemm_fn && !disti_blas_works(&desc->blas))
-        return disti_fail(ctx, DIST_BAD_ARGUMENT,
-                          "%s: blas.sgemm_fn fails its self-test: C = alpha op(A) op(B) + beta C, row-major, gives wrong numbers",
-                          name, 0, 0);
+        return disti_fail(
+            ctx, DIST_BAD_ARGUMENT,
+            "%s: blas.sgemm_fn fails its self-test: C = alpha op(A) op(B) + beta C, row-major, gives wrong numbers",
+            name, 0, 0);
     return DIST_OK;
 }
 
@@ -1148,14 +1167,15 @@ DIST_API int dist_context_workers(const dist_context *ctx)
     return ctx ? ctx->workers : 0;
 }
 
-/*@ 03 kernels ------------------------------------------------------------------------------------------------------------- */
+/*@ 03 kernels ------------------------------------------------------------------------------------------------------ */
 
 /* Points stand in the lanes: activations of a block of DISTI_BLOCK points are rows [unit][DISTI_BLOCK], and a layer's
-   weights are packed in panels of eight outputs, element (o, k) at ((o / 8) * rows + k) * 8 + o % 8, so that one broadcast
-   serves a whole row. Nothing is ever transposed on the way forward; the reverse pass reads the same packing. */
+   weights are packed in panels of eight outputs, element (o, k) at ((o / 8) * rows + k) * 8 + o % 8, so that one
+   broadcast serves a whole row. Nothing is ever transposed on the way forward; the reverse pass reads the same
+      packing. */
 enum { DISTI_BLOCK = 48 };
 
-/* forward   y[o][c] = bias[o] + sum_k weights(o, k) x[k][c]        k ascending over alive[0..alive_count-1], or all rows
+/* forward   y[o][c] = bias[o] + sum_k weights(o, k) x[k][c]     k ascending over alive[0..alive_count-1], or all rows
              with mask: y = max(0, y) and bit c of mask[o] = y[o][c] > 0
    Leaving out rows that are zero for the whole block changes no bit of the result.
    All matrices are 64-byte aligned; y, bias and mask hold `out` rounded up to a multiple of 8; columns beyond `columns`
@@ -1170,7 +1190,7 @@ typedef struct disti_gemm {
     int rows, alive_count, out, columns;
 } disti_gemm;
 
-/* backward  d_x[k][c] = (bit c of mask[k]) * sum_o weights(o, k) d_y[o][c]     o ascending over alive_out, k over alive_rows
+/* backward  d_x[k][c] = (bit c of mask[k]) * sum_o weights(o, k) d_y[o][c]     o ascending over alive_out, k listed
    NULL lists: all; NULL mask: all ones. Rows of d_x that are not listed are not written. */
 typedef struct disti_gemm_back {
     const float *weights;
@@ -1196,7 +1216,8 @@ typedef struct disti_kernels {
     void (*gemm_back)(const disti_gemm_back *g);
     void (*gemm_weights)(const disti_gemm_weights *g);
     /* y[c] = bias + sum_k w[k] x[k][c], c < DISTI_BLOCK, over alive rows (NULL: all): the last layer's single output */
-    void (*dot)(const float *w, float bias, const float *x, const int *alive, int alive_count, int rows, int columns, float *y);
+    void (*dot)(const float *w, float bias, const float *x, const int *alive, int alive_count, int rows, int columns,
+                float *y);
     /* y[k][c] = (bit c of mask[k]) * w[k] s[c] for the listed rows (NULL: all): its adjoint */
     void (*outer)(const float *w, const float *s, const int *alive, int alive_count, int rows, int columns,
                   const uint64_t *mask, float *y);
@@ -1290,8 +1311,8 @@ static void disti_outer_scalar(const float *w, const float *s, const int *alive,
      DISTI_SET1(s) DISTI_LOAD(p) DISTI_STORE(p, v) DISTI_ADD(a, b) DISTI_FMA(a, b, c)    the last is a b + c
      DISTI_RELU(v) DISTI_POSITIVE(v)    max(v, 0), and the bits of the lanes that are greater than 0
      DISTI_KEEP(v, bits)                v with 0 where the lane's bit is 0
-     DISTI_DEPTH                        rows that one pass takes: 112 of 192 bytes stay in a first cache of 32 KiB, beside
-                                        the weights; wide vectors ask for less and keep up with the second cache
+     DISTI_DEPTH                        rows that one pass takes: 112 of 192 bytes stay in a first cache of 32 KiB
+                                        beside the weights; wide vectors ask for less and can use the second cache
    A tile of R rows and V vectors keeps its sums in variables a<row><vector>: gcc holds those in registers where it
    would spill an array. A row's factor is broadcast and serves its V vectors; in the forward pass the factors of a
    tile stand side by side, elsewhere at R offsets k<row>. */
@@ -1336,9 +1357,8 @@ static void disti_outer_scalar(const float *w, const float *s, const int *alive,
         mask[i] |= (bits << c) & columns;                                                                              \
     }
 
-/* Takes inputs from..to-1 of the list or of all; between two passes over DISTI_DEPTH rows the sums wait in y. Weights are
-   fetched ahead: the next ones, which are the next panel's at its end, or where passes cut the panels, the next panel's
-   own. */
+/* Takes inputs from..to-1 of the list or of all; between two passes over DISTI_DEPTH rows the sums wait in y.
+   Weights are fetched `ahead` floats early: a little, or a whole panel where passes cut the panels. */
 #define DISTI_GEMM_TILE(name, R, V)                                                                                    \
     DISTI_NOINLINE DISTI_FUNCTION void disti_gemm_##name(const disti_gemm *g, int o, int c, int from, int to,          \
                                                           size_t ahead)                                                \
@@ -1831,7 +1851,8 @@ static float disti_sigmoid(float x)
     return x < 0.0f ? e / (1.0f + e) : 1.0f / (1.0f + e);
 }
 
-/* Their derivatives, by e = exp(-2 |x|) and exp(-|x|): relatively exact where 1 - tanh^2 would have cancelled to nothing. */
+/* Their derivatives, by e = exp(-2 |x|) and exp(-|x|): relatively exact where 1 - tanh^2 would have cancelled to
+   nothing. */
 static float disti_tanh_slope(float x)
 {
     float e = disti_exp(x < 0.0f ? 2.0f * x : -2.0f * x);
@@ -1850,7 +1871,9 @@ static float disti_log1p_exp(float a)
     float u = disti_exp(-a);
     float s = u / (2.0f + u);
     float q = s * s;
-    return 2.0f * s * (1.0f + q * (1.0f / 3 + q * (1.0f / 5 + q * (1.0f / 7 + q * (1.0f / 9 + q * (1.0f / 11 + q * (1.0f / 13)))))));
+    return 2.0f * s *
+           (1.0f +
+            q * (1.0f / 3 + q * (1.0f / 5 + q * (1.0f / 7 + q * (1.0f / 9 + q * (1.0f / 11 + q * (1.0f / 13)))))));
 }
 
 /* Sine and cosine of a double, range-reduced by multiples of pi / 2 in two parts: full float accuracy up to 1e9, and
@@ -1862,8 +1885,11 @@ static void disti_sincos(double x, double *sine, double *cosine)
     int64_t k = (int64_t)(q < 0 ? q - 0.5 : q + 0.5);
     double r = (x - (double)k * 1.57079632673412561417) - (double)k * 6.07710050650619224932e-11;
     double s = r * r;
-    double sn = r + r * s * (-1.66666666666666324348e-1 + s * (8.33333333332248946124e-3 + s * (-1.98412698298579493134e-4 +
-                s * (2.75573137070700676789e-6 + s * -2.50507602534068634195e-8))));
+    double sn = r + r * s *
+                        (-1.66666666666666324348e-1 +
+                         s * (8.33333333332248946124e-3 +
+                              s * (-1.98412698298579493134e-4 +
+                                   s * (2.75573137070700676789e-6 + s * -2.50507602534068634195e-8))));
     double cs = 1.0 - s * (0.5 - s * (4.16666666666666019037e-2 - s * (1.38888888888741095749e-3 -
                 s * (2.48015872894767294178e-5 - s * 2.75573143513906633035e-7))));
     int odd = (int)(k & 1);
@@ -1912,7 +1938,7 @@ static void disti_activate(int activation, float scale, size_t n, float *y, floa
     }
 }
 
-/*@ 04 field --------------------------------------------------------------------------------------------------------------- */
+/*@ 04 field -------------------------------------------------------------------------------------------------------- */
 
 /* Analytic fields: f, grad f and the adjoint for the numbers they are made of, in one function each; q = p - center.
    At the few points where |q| or the like is 0 the gradient is 0. */
@@ -1955,7 +1981,8 @@ static void disti_torus_point(const float *c, const float *p, float *f, float *g
 }
 
 /* box       a = |q| - half,  f = |max(a, 0)| + min(max(a), 0)
-   backward  outside: df/da = max(a, 0) / |max(a, 0)|; inside: 1 for the largest a; df/dp = sign(q) df/da, df/dhalf = -df/da */
+   backward  outside: df/da = max(a, 0) / |max(a, 0)|; inside: 1 for the largest a;
+             df/dp = sign(q) df/da, df/dhalf = -df/da */
 static void disti_box_point(const float *c, const float *p, float *f, float *g, float *d_c)
 {
     float a[3], d_a[3] = {0.0f, 0.0f, 0.0f};
@@ -1984,7 +2011,8 @@ static void disti_box_point(const float *c, const float *p, float *f, float *g, 
 
 typedef void (*disti_point_fn)(const float *c, const float *p, float *f, float *g, float *d_c);
 
-static void disti_analytic_eval(disti_point_fn point_fn, void *user, size_t n, const float *points, float *sdf, float *gradient)
+static void disti_analytic_eval(disti_point_fn point_fn, void *user, size_t n, const float *points, float *sdf,
+                                float *gradient)
 {
     for (size_t i = 0; i < n; i++) {
         float g[3], d_c[8];
@@ -2020,17 +2048,18 @@ static dist_field disti_analytic(const float *numbers, int size, float radius)
     return field;
 }
 
-#define DISTI_ANALYTIC(name, size)                                                                                          \
-    static void disti_##name##_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)    \
-    {                                                                                                                      \
-        (void)worker;                                                                                                      \
-        disti_analytic_eval(disti_##name##_point, user, n, points, sdf, gradient);                                         \
-    }                                                                                                                      \
-    static void disti_##name##_adjoint(void *user, int worker, size_t n, const float *points, const float *d_sdf,          \
-                                       double *d_code)                                                                     \
-    {                                                                                                                      \
-        (void)worker;                                                                                                      \
-        disti_analytic_adjoint(disti_##name##_point, size, user, n, points, d_sdf, d_code);                                \
+#define DISTI_ANALYTIC(name, size)                                                                                     \
+    static void disti_##name##_eval(void *user, int worker, size_t n, const float *points, float *sdf,                 \
+                                    float *gradient)                                                                   \
+    {                                                                                                                  \
+        (void)worker;                                                                                                  \
+        disti_analytic_eval(disti_##name##_point, user, n, points, sdf, gradient);                                     \
+    }                                                                                                                  \
+    static void disti_##name##_adjoint(void *user, int worker, size_t n, const float *points, const float *d_sdf,      \
+                                       double *d_code)                                                                 \
+    {                                                                                                                  \
+        (void)worker;                                                                                                  \
+        disti_analytic_adjoint(disti_##name##_point, size, user, n, points, d_sdf, d_code);                            \
     }
 
 DISTI_ANALYTIC(sphere, 4)
@@ -2055,7 +2084,8 @@ DIST_API dist_field dist_field_torus(const float center_radii[5])
 
 DIST_API dist_field dist_field_box(const float center_half[6])
 {
-    dist_field field = disti_analytic(center_half, 6, 1.1f * disti_length(center_half[3], center_half[4], center_half[5]));
+    dist_field field = disti_analytic(center_half, 6,
+                                      1.1f * disti_length(center_half[3], center_half[4], center_half[5]));
     field.eval_fn = disti_box_eval;
     field.adjoint_fn = disti_box_adjoint;
     return field;
@@ -2067,10 +2097,11 @@ static dist_status disti_field_check(dist_context *ctx, const dist_field *field,
     if (!field) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field is NULL", function, 0, 0);
     if (!field->eval_fn)
         return disti_fail(ctx, DIST_BAD_ARGUMENT,
-                          "%s: field.eval_fn is NULL (a failed create, or a net without a distance channel)", function, 0, 0);
+                          "%s: field.eval_fn is NULL (a failed create, or a net without a distance channel)", function,
+                          0, 0);
     if (!disti_finite_all(3, field->center) || !disti_finite(field->radius) || !(field->radius > 0.0f))
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.radius is %d, must be positive and the center finite", function,
-                          (double)field->radius, 0);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.radius is %d, must be positive and the center finite",
+                          function, (double)field->radius, 0);
     if (!disti_finite(field->lipschitz) || field->lipschitz < 0.0f)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.lipschitz is %d, must be 0 or positive", function,
                           (double)field->lipschitz, 0);
@@ -2131,8 +2162,8 @@ static void disti_field_eval_all(dist_context *ctx, const dist_field *field, siz
     disti_run(ctx, job.pieces.count, disti_eval_task, &job);
 }
 
-DIST_API dist_status dist_field_eval(dist_context *ctx, const dist_field *field, size_t n, const float *points, float *sdf,
-                                     float *gradient)
+DIST_API dist_status dist_field_eval(dist_context *ctx, const dist_field *field, size_t n, const float *points,
+                                     float *sdf, float *gradient)
 {
     dist_status status = disti_enter(ctx, "dist_field_eval");
     if (status == DIST_OK) status = disti_field_check(ctx, field, "dist_field_eval");
@@ -2162,7 +2193,8 @@ typedef struct disti_backward_piece {
     size_t first;
 } disti_backward_piece;
 
-static void disti_backward_seed(void *user, size_t first, size_t count, const float *sdf, const float *gradient, float *d_sdf)
+static void disti_backward_seed(void *user, size_t first, size_t count, const float *sdf, const float *gradient,
+                                float *d_sdf)
 {
     const disti_backward_piece *piece = (const disti_backward_piece *)user;
     const disti_backward_job *job = piece->job;
@@ -2199,8 +2231,9 @@ static void disti_backward_task(void *arg, int index, int worker)
 }
 
 /* dist_field_backward behind the door: d_code in double, partial sums in slot order. ctx->partial is large enough. */
-static void disti_field_backward_all(dist_context *ctx, const dist_field *field, size_t n, const float *points, float *d_sdf,
-                                     dist_seed_fn seed_fn, void *seed_user, float *d_points, double *d_code)
+static void disti_field_backward_all(dist_context *ctx, const dist_field *field, size_t n, const float *points,
+                                     float *d_sdf, dist_seed_fn seed_fn, void *seed_user, float *d_points,
+                                     double *d_code)
 {
     disti_backward_job job;
     size_t size = (size_t)field->code_size;
@@ -2228,7 +2261,8 @@ static dist_status disti_gradients_check(dist_context *ctx, const dist_field *fi
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: grads.code is given, but the field has no code or no adjoint_fn",
                           function, 0, 0);
     if (grads->weights && !field->weights_fn)
-        return disti_fail(ctx, DIST_UNSUPPORTED, "%s: grads.weights is given, but the field has no weights_fn", function, 0, 0);
+        return disti_fail(ctx, DIST_UNSUPPORTED, "%s: grads.weights is given, but the field has no weights_fn",
+                          function, 0, 0);
     return DIST_OK;
 }
 
@@ -2243,10 +2277,11 @@ DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *fi
     if (status != DIST_OK || n == 0) return status;
     if (!points) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: points is NULL", name, 0, 0);
     if (!d_sdf && (!seed_fn || grads->weights))
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: d_sdf is NULL, needed without seed_fn and for weights", name, 0, 0);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: d_sdf is NULL, needed without seed_fn and for weights", name, 0,
+                          0);
     if (grads->rotation || grads->translation)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: grads.rotation and grads.translation must be NULL: no camera here", name,
-                          0, 0);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT,
+                          "%s: grads.rotation and grads.translation must be NULL: no camera here", name, 0, 0);
     size_t size = (size_t)field->code_size;
     /* one more slot than the pieces use: the total */
     status = disti_partial_reserve(ctx, size + size / DISTI_SLOTS + 1);
@@ -2257,7 +2292,8 @@ DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *fi
         memset(d_code, 0, size * sizeof(double));
     }
     if (grads->weights)
-        status = field->weights_fn(field->user, ctx, n, points, d_sdf, seed_fn, seed_user, d_points, d_code, grads->weights);
+        status = field->weights_fn(field->user, ctx, n, points, d_sdf, seed_fn, seed_user, d_points, d_code,
+                                   grads->weights);
     else
         disti_field_backward_all(ctx, field, n, points, d_sdf, seed_fn, seed_user, d_points, d_code);
     if (status == DIST_OK && d_code)
@@ -3114,7 +3150,7 @@ typedef struct disti_block {
     float *d_point;    /* its gradient */
     float *act[2];     /* (max_rows, B): a layer's input */
     float *delta[2];   /* (max_rows, B): dL/d(pre-activation) */
-    float *fold_delta; /* (fold_count, max_rows, B): that of the layers that see the code, kept until the seeds are known */
+    float *fold_delta; /* (fold_count, max_rows, B): that of the layers that see the code, until the seeds are known */
     uint64_t *mask;    /* (layers, max_rows): which lanes of a layer's input rows are alive */
     int *alive;        /* (layers, max_rows): rows of a layer's input that are alive anywhere in the block */
     float *slope;      /* (layers, max_rows, B): activation's derivative; not for ReLU */
@@ -3129,7 +3165,8 @@ typedef struct disti_block {
 
 static void *disti_take(unsigned char *base, size_t *at, size_t count, size_t size)
 {
-    size_t bytes = (count * size + DISTI_ALIGNMENT - 1) & ~(size_t)(DISTI_ALIGNMENT - 1); /* small factors: cannot overflow */
+    size_t bytes = (count * size + DISTI_ALIGNMENT - 1) &
+                   ~(size_t)(DISTI_ALIGNMENT - 1); /* small factors: cannot overflow */
     unsigned char *p = base ? base + *at : NULL;
     *at += bytes;
     return p;
@@ -3160,8 +3197,8 @@ static size_t disti_block_layout(const dist_net *net, unsigned char *base, disti
     return at;
 }
 
-/* What weight gradients need of each layer, one block's share of the store: the input transposed (B, stride) and scaled, the
-   pre-activation's delta (out8, B), and the sums for LayerNorm's gamma and beta (out8 each). */
+/* What weight gradients need of each layer, one block's share of the store: the input transposed (B, stride) and
+   scaled, the pre-activation's delta (out8, B), and the sums for LayerNorm's gamma and beta (out8 each). */
 static size_t disti_store_stride(const disti_linear *layer)
 {
     return ((size_t)(layer->prev + layer->point) + 15) & ~(size_t)15;
@@ -3199,7 +3236,8 @@ static int disti_encoding_row(const dist_net *net, int level, int axis, int cosi
 static void disti_encode(const dist_net *net, size_t n, const float *points, float *rows)
 {
     for (size_t c = 0; c < DISTI_BLOCK; c++) {
-        const float *p = points + 3 * (c < n ? c : n - 1); /* idle lanes repeat the last point: no unit lives for them alone */
+        const float *p = points +
+                         3 * (c < n ? c : n - 1); /* idle lanes repeat the last point: no unit lives for them alone */
         for (int axis = 0; axis < 3; axis++) {
             double s, co;
             if (net->raw) rows[(size_t)axis * DISTI_BLOCK + c] = p[axis];
@@ -3234,8 +3272,10 @@ static void disti_encode_backward(const dist_net *net, const float *rows, const 
     }
 }
 
-/* forward   mu = mean_u x, v = mean_u (x - mu)^2, hat = (x - mu) / sqrt(v + eps), y = gamma hat + beta     for each lane */
-static void disti_norm(int units, float epsilon, const float *gamma, const float *beta, float *x, float *hat, float *inverse)
+/* forward   mu = mean_u x, v = mean_u (x - mu)^2, hat = (x - mu) / sqrt(v + eps), y = gamma hat + beta, for each
+   lane */
+static void disti_norm(int units, float epsilon, const float *gamma, const float *beta, float *x, float *hat,
+                       float *inverse)
 {
     float mean[DISTI_BLOCK], variance[DISTI_BLOCK];
     size_t count = (size_t)units;
@@ -3260,7 +3300,8 @@ static void disti_norm(int units, float epsilon, const float *gamma, const float
     }
 }
 
-/* backward  g = gamma d_y,  d_x = (g - mean_u g - hat mean_u (g hat)) / sqrt(v + eps)                    in place: d is d_y, then d_x */
+/* backward  g = gamma d_y,  d_x = (g - mean_u g - hat mean_u (g hat)) / sqrt(v + eps)     in place: d is d_y, then
+   d_x */
 static void disti_norm_backward(int units, const float *gamma, const float *hat, const float *inverse, float *d)
 {
     float mean[DISTI_BLOCK], along[DISTI_BLOCK];
@@ -3320,11 +3361,11 @@ static void disti_linear_blas(const dist_shape *shape, int l, const float *x, fl
     for (size_t o = 0; o < (size_t)layer->out; o++)
         for (size_t c = 0; c < DISTI_BLOCK; c++) y[o * DISTI_BLOCK + c] = bias[o];
     if (layer->prev > 0)
-        blas->sgemm_fn(blas->user, 0, 0, layer->out, DISTI_BLOCK, layer->prev, layer->scale, w + layer->x_column, layer->in, x,
-                       DISTI_BLOCK, 1.0f, y, DISTI_BLOCK);
+        blas->sgemm_fn(blas->user, 0, 0, layer->out, DISTI_BLOCK, layer->prev, layer->scale, w + layer->x_column,
+                       layer->in, x, DISTI_BLOCK, 1.0f, y, DISTI_BLOCK);
     if (layer->point > 0)
-        blas->sgemm_fn(blas->user, 0, 0, layer->out, DISTI_BLOCK, layer->point, layer->scale, w + layer->point_column, layer->in,
-                       x + (size_t)layer->prev * DISTI_BLOCK, DISTI_BLOCK, 1.0f, y, DISTI_BLOCK);
+        blas->sgemm_fn(blas->user, 0, 0, layer->out, DISTI_BLOCK, layer->point, layer->scale, w + layer->point_column,
+                       layer->in, x + (size_t)layer->prev * DISTI_BLOCK, DISTI_BLOCK, 1.0f, y, DISTI_BLOCK);
 }
 
 static int disti_use_blas(const dist_shape *shape, int l)
@@ -3341,7 +3382,8 @@ static void disti_transpose(size_t rows, size_t stride, float scale, const float
 }
 
 /* Hidden layer l: x to the input of layer l + 1 in y, with everything that its adjoint reads. */
-static void disti_hidden(const dist_shape *shape, const disti_kernels *kernels, disti_block *b, int l, const float *x, float *y)
+static void disti_hidden(const dist_shape *shape, const disti_kernels *kernels, disti_block *b, int l, const float *x,
+                         float *y)
 {
     const dist_net *net = shape->net;
     const disti_linear *layer = &net->layer[l];
@@ -3391,7 +3433,9 @@ static const float *disti_net_forward(const dist_shape *shape, disti_block *b, f
     for (int l = 0; l < net->layers; l++) {
         const disti_linear *layer = &net->layer[l];
         size_t rows = (size_t)(layer->prev + layer->point);
-        if (store) disti_transpose(rows, disti_store_stride(layer), layer->scale, x, store + disti_store_offset(net, l, DISTI_STORE_INPUT));
+        if (store)
+            disti_transpose(rows, disti_store_stride(layer), layer->scale, x,
+                            store + disti_store_offset(net, l, DISTI_STORE_INPUT));
         done += (double)b->alive_count[l] * layer->out;
         if (l + 1 == net->layers) break;
         disti_hidden(shape, &kernels, b, l, x, b->act[l & 1]);
@@ -3402,7 +3446,8 @@ static const float *disti_net_forward(const dist_shape *shape, disti_block *b, f
 }
 
 /* Channel `channel` of the last layer, B lanes: value after the output function, and its slope. */
-static void disti_net_output(const dist_shape *shape, const disti_block *b, const float *x, int channel, float *value, float *slope)
+static void disti_net_output(const dist_shape *shape, const disti_block *b, const float *x, int channel, float *value,
+                             float *slope)
 {
     const dist_net *net = shape->net;
     int l = net->layers - 1;
@@ -3411,7 +3456,8 @@ static void disti_net_output(const dist_shape *shape, const disti_block *b, cons
     disti_kernels kernels = disti_kernels_for(shape->ctx->isa);
     const int *alive = b->alive_count[l] < rows ? b->alive + (size_t)l * (size_t)net->max_rows : NULL;
     float bias = shape->bias[(size_t)l * (size_t)net->max_rows + (size_t)channel];
-    kernels.dot(net->panels + layer->panel + (size_t)channel * (size_t)rows, bias, x, alive, b->alive_count[l], rows, b->columns, value);
+    kernels.dot(net->panels + layer->panel + (size_t)channel * (size_t)rows, bias, x, alive, b->alive_count[l], rows,
+                b->columns, value);
     for (size_t c = 0; c < DISTI_BLOCK; c++) {
         float v = value[c], d = 1.0f;
         if (net->output == DISTI_OUTPUT_TANH || net->output == DISTI_OUTPUT_TANH_TWICE) {
@@ -3431,8 +3477,8 @@ static void disti_net_output(const dist_shape *shape, const disti_block *b, cons
     }
 }
 
-/* delta of layer l's output (after the activation) to that of its pre-activation, in place. ReLU's mask is in it already.
-   sums, unless NULL, gets what gamma and beta receive: sum_c delta hat, sum_c delta. */
+/* delta of layer l's output (after the activation) to that of its pre-activation, in place. ReLU's mask is in it
+   already. sums, unless NULL, gets what gamma and beta receive: sum_c delta hat, sum_c delta. */
 static void disti_hidden_delta(const dist_net *net, const disti_block *b, int l, float *delta, float *sums)
 {
     const disti_linear *layer = &net->layer[l];
@@ -3486,11 +3532,12 @@ static void disti_linear_backward(const dist_shape *shape, const disti_kernels *
             for (size_t u = 0; u < (size_t)layer->out; u++)
                 if (!mine[u]) memset(rows.out + u * DISTI_BLOCK, 0, DISTI_BLOCK * sizeof(float));
         }
-        blas->sgemm_fn(blas->user, 1, 0, layer->prev, DISTI_BLOCK, layer->out, layer->scale, w + layer->x_column, layer->in,
-                       delta, DISTI_BLOCK, 0.0f, d_x, DISTI_BLOCK);
+        blas->sgemm_fn(blas->user, 1, 0, layer->prev, DISTI_BLOCK, layer->out, layer->scale, w + layer->x_column,
+                       layer->in, delta, DISTI_BLOCK, 0.0f, d_x, DISTI_BLOCK);
         if (layer->point > 0)
-            blas->sgemm_fn(blas->user, 1, 0, layer->point, DISTI_BLOCK, layer->out, layer->scale, w + layer->point_column,
-                           layer->in, delta, DISTI_BLOCK, 0.0f, d_x + (size_t)layer->prev * DISTI_BLOCK, DISTI_BLOCK);
+            blas->sgemm_fn(blas->user, 1, 0, layer->point, DISTI_BLOCK, layer->out, layer->scale,
+                           w + layer->point_column, layer->in, delta, DISTI_BLOCK, 0.0f,
+                           d_x + (size_t)layer->prev * DISTI_BLOCK, DISTI_BLOCK);
         for (size_t u = 0; mask && u < (size_t)g.rows; u++)
             for (size_t c = 0; c < DISTI_BLOCK; c++)
                 if (!(mask[u] >> c & 1u)) d_x[u * DISTI_BLOCK + c] = 0.0f;
@@ -3538,8 +3585,8 @@ static void disti_net_reverse(const dist_shape *shape, disti_block *b, const flo
     memset(b->d_point, 0, (size_t)net->point_size * DISTI_BLOCK * sizeof(float));
     float *delta = b->delta[last & 1];
     kernels.outer(net->panels + layer->panel + (size_t)net->sdf_channel * (size_t)rows, seed,
-                  b->alive_count[last] < rows ? b->alive + (size_t)last * width : NULL, b->alive_count[last], rows, b->columns,
-                  net->activation == DIST_ACTIVATION_RELU ? b->mask + (size_t)last * width : NULL, delta);
+                  b->alive_count[last] < rows ? b->alive + (size_t)last * width : NULL, b->alive_count[last], rows,
+                  b->columns, net->activation == DIST_ACTIVATION_RELU ? b->mask + (size_t)last * width : NULL, delta);
     disti_add_point_rows(layer, delta, b->d_point);
     if (store) memcpy(store + disti_store_offset(net, last, DISTI_STORE_DELTA), seed, DISTI_BLOCK * sizeof(float));
     if (layer->code) {
@@ -3567,7 +3614,7 @@ static void disti_block_begin(const dist_shape *shape, int worker, disti_block *
     disti_counter_of(shape->ctx, worker)->dense += (double)dist_net_operations(shape->net, 1) * (double)n;
 }
 
-/* d_code += sum over the layers that see the code of scale W_code^T S,  S[o] = sum over points of delta[o]    (DESIGN: folding) */
+/* d_code += sum over the layers that see the code of scale W_code^T S,  S[o] = sum over points of delta[o] */
 static void disti_fold_backward(const dist_net *net, const double *fold_sum, double *d_code)
 {
     size_t fold = 0;
@@ -3604,8 +3651,8 @@ static void disti_fold_sum(const dist_net *net, const disti_block *b, const floa
     }
 }
 
-/* dist_field.fused_fn of a net. The reverse pass runs from f's own slope (seed 1), so that it leaves grad f; delta is linear
-   in the seed, so the seeds may come afterwards: d_code needs only sum_c seed[c] delta[.][c]. */
+/* dist_field.fused_fn of a net. The reverse pass runs from f's own slope (seed 1), so that it leaves grad f; delta
+   is linear in the seed, so the seeds may come afterwards: d_code needs only sum_c seed[c] delta[.][c]. */
 static void disti_shape_fused(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient,
                               void (*seed_fn)(void *seed_user, size_t first, size_t count, const float *sdf,
                                               const float *gradient, float *d_sdf),
@@ -3619,7 +3666,8 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
     for (size_t at = 0; at < n; at += DISTI_BLOCK) {
         size_t count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK);
         disti_block_begin(shape, worker, &b, count, points + 3 * at);
-        float *value = b.tail, *slope = b.tail + DISTI_BLOCK, *seed = b.tail + 2 * DISTI_BLOCK, *g = b.tail + 8 * DISTI_BLOCK;
+        float *value = b.tail, *slope = b.tail + DISTI_BLOCK, *seed = b.tail + 2 * DISTI_BLOCK,
+              *g = b.tail + 8 * DISTI_BLOCK;
         const float *x = disti_net_forward(shape, &b, NULL, disti_counter_of(shape->ctx, worker));
         disti_net_output(shape, &b, x, net->sdf_channel, value, slope);
         if (sdf) memcpy(sdf + at, value, count * sizeof(float));
@@ -3640,8 +3688,8 @@ static void disti_shape_eval_fn(void *user, int worker, size_t n, const float *p
 }
 
 /* All channels (n, channels), or `count` of them from `first`. */
-static void disti_shape_channels(const dist_shape *shape, int worker, size_t n, const float *points, int first, int count,
-                                 float *channels)
+static void disti_shape_channels(const dist_shape *shape, int worker, size_t n, const float *points, int first,
+                                 int count, float *channels)
 {
     for (size_t at = 0; at < n; at += DISTI_BLOCK) {
         disti_block b;
@@ -3662,8 +3710,8 @@ static void disti_shape_color_fn(void *user, int worker, size_t n, const float *
 }
 
 #ifndef DIST_NO_TRAIN
-/* Weight gradients go in two phases over a chunk of blocks, so that no partial sums are needed and the bits do not depend
-   on the threads: blocks in parallel leave inputs and deltas in the store; then rows of weights in parallel add
+/* Weight gradients go in two phases over a chunk of blocks, so that no partial sums are needed and the bits do not
+   depend on the threads: blocks in parallel leave inputs and deltas in the store; then rows of weights in parallel add
        dW[o][k] += sum over points of delta[o] x[k],   db[o] += sum of delta[o],   dW[o][code] += db[o] code. */
 typedef struct disti_weights_job {
     const dist_shape *shape;
@@ -3689,7 +3737,8 @@ static void disti_weights_block(void *arg, int index, int worker)
     size_t count = DISTI_MIN(job->n - at, (size_t)DISTI_BLOCK);
     float *store = shape->store + (size_t)index * shape->store_block_size;
     disti_block_begin(shape, worker, &b, count, job->points + 3 * at);
-    float *value = b.tail, *slope = b.tail + DISTI_BLOCK, *seed = b.tail + 2 * DISTI_BLOCK, *g = b.tail + 8 * DISTI_BLOCK;
+    float *value = b.tail, *slope = b.tail + DISTI_BLOCK, *seed = b.tail + 2 * DISTI_BLOCK,
+          *g = b.tail + 8 * DISTI_BLOCK;
     const float *x = disti_net_forward(shape, &b, store, disti_counter_of(shape->ctx, worker));
     disti_net_output(shape, &b, x, net->sdf_channel, value, slope);
     if (job->seed_fn) job->seed_fn(job->seed_user, at, count, value, NULL, seed);
@@ -3741,7 +3790,8 @@ static void disti_weights_rows(const disti_weights_job *job, int l, size_t o, si
         float *to = w + i * (size_t)layer->in;
         for (size_t k = 0; k < (size_t)layer->point; k++) {
             float s = 0.0f;
-            for (size_t c = 0; c < columns; c++) s += delta[i * DISTI_BLOCK + c] * xt[c * g.xt_stride + (size_t)layer->prev + k];
+            for (size_t c = 0; c < columns; c++)
+                s += delta[i * DISTI_BLOCK + c] * xt[c * g.xt_stride + (size_t)layer->prev + k];
             to[(size_t)layer->point_column + k] += s;
         }
         for (size_t j = 0; j < (size_t)layer->code; j++)
@@ -3806,9 +3856,9 @@ static dist_status disti_shape_weights_fn(void *user, dist_context *ctx, size_t 
 }
 #endif
 
-/* Sampled |grad f| in the bounding sphere: the 90th percentile of 768 points, at least 1: what matters is not the steepest
-   spot but how far f exceeds the distance, which is its mean slope on the way. The points are those of a fixed low-discrepancy
-   sequence (the plastic number's). */
+/* Sampled |grad f| in the bounding sphere: the 90th percentile of 768 points, at least 1: what matters is not the
+   steepest spot but how far f exceeds the distance, which is its mean slope on the way. The points are those of a
+   fixed low-discrepancy sequence (the plastic number's). */
 static float disti_shape_slope(dist_shape *shape, const dist_field *field)
 {
     enum { SAMPLES = 768, BINS = 256 };
@@ -3868,7 +3918,7 @@ DIST_API dist_field dist_shape_field(dist_shape *shape)
     return field;
 }
 
-/* bias'[o] = bias[o] + scale sum_j W_code[o][j] code[j], in double                                          (folding; exact but for rounding) */
+/* Folding: bias'[o] = bias[o] + scale sum_j W_code[o][j] code[j], in double; exact but for one rounding. */
 DIST_API dist_status dist_shape_set_code(dist_shape *shape, const float *code)
 {
     if (!shape) return DIST_BAD_ARGUMENT;
@@ -3876,8 +3926,8 @@ DIST_API dist_status dist_shape_set_code(dist_shape *shape, const float *code)
     size_t size = (size_t)net->code_size;
     for (size_t j = 0; code && j < size; j++)
         if (!disti_finite(code[j]))
-            return disti_fail(shape->ctx, DIST_NOT_FINITE, "dist_shape_set_code: code[%d] is %d, must be finite", NULL, (double)j,
-                              (double)code[j]);
+            return disti_fail(shape->ctx, DIST_NOT_FINITE, "dist_shape_set_code: code[%d] is %d, must be finite", NULL,
+                              (double)j, (double)code[j]);
     if (code) memcpy(shape->code, code, size * sizeof(float));
     else memset(shape->code, 0, size * sizeof(float));
     for (int l = 0; l < net->layers; l++) {
@@ -3914,7 +3964,8 @@ DIST_API dist_shape *dist_shape_create(dist_context *ctx, const dist_net *net, c
         return NULL;
     }
     if (disti_scratch_reserve(ctx, DISTI_FIELD_OFFSET + disti_block_layout(net, NULL, &b)) != DIST_OK) return NULL;
-    if (disti_partial_reserve(ctx, (size_t)net->code_size + (size_t)net->code_size / DISTI_SLOTS + 1) != DIST_OK) return NULL;
+    if (disti_partial_reserve(ctx, (size_t)net->code_size + (size_t)net->code_size / DISTI_SLOTS + 1) != DIST_OK)
+        return NULL;
     dist_shape *shape = (dist_shape *)disti_alloc(ctx, sizeof(dist_shape));
     if (!shape) return NULL;
     memset(shape, 0, sizeof *shape);
@@ -3958,11 +4009,12 @@ static void disti_channels_task(void *arg, int index, int worker)
     const disti_channels_job *job = (const disti_channels_job *)arg;
     size_t first = (size_t)index * job->pieces.size;
     int channels = job->shape->net->channels;
-    disti_shape_channels(job->shape, worker, DISTI_MIN(job->pieces.size, job->pieces.n - first), job->points + 3 * first, 0,
-                         channels, job->channels + first * (size_t)channels);
+    disti_shape_channels(job->shape, worker, DISTI_MIN(job->pieces.size, job->pieces.n - first),
+                         job->points + 3 * first, 0, channels, job->channels + first * (size_t)channels);
 }
 
-DIST_API dist_status dist_shape_eval(dist_context *ctx, dist_shape *shape, size_t n, const float *points, float *channels)
+DIST_API dist_status dist_shape_eval(dist_context *ctx, dist_shape *shape, size_t n, const float *points,
+                                     float *channels)
 {
     disti_channels_job job;
     dist_status status = disti_enter(ctx, "dist_shape_eval");
@@ -4031,7 +4083,8 @@ static dist_net *disti_net_new(dist_context *ctx)
 
 /* From the in and out of every layer, the sizes of input and code and the skips: what each column is, where each tensor
    stands in params and panels, and the memory for both. */
-static dist_status disti_net_arrange(dist_context *ctx, dist_net *net, const char *function, const int *skip, float skip_scale)
+static dist_status disti_net_arrange(dist_context *ctx, dist_net *net, const char *function, const int *skip,
+                                     float skip_scale)
 {
     int input = net->point_size + net->code_size;
     for (int l = 0; l < net->layers; l++) {
@@ -4042,8 +4095,8 @@ static dist_status disti_net_arrange(dist_context *ctx, dist_net *net, const cha
         layer->code = sees_input ? net->code_size : 0;
         layer->scale = l > 0 && skip[l] ? skip_scale : 1.0f;
         if (layer->in != layer->prev + (sees_input ? input : 0))
-            return disti_fail(ctx, DIST_BAD_FILE, "%s: a layer is %d wide at its input, but what feeds it has %d", function,
-                              layer->in, layer->prev + (sees_input ? input : 0));
+            return disti_fail(ctx, DIST_BAD_FILE, "%s: a layer is %d wide at its input, but what feeds it has %d",
+                              function, layer->in, layer->prev + (sees_input ? input : 0));
         int at = layer->prev > 0 && !net->skip_input_first ? layer->prev : 0;
         layer->x_column = at > 0 || !sees_input ? 0 : input;
         layer->point_column = at + (net->point_first ? 0 : net->code_size);
@@ -4065,7 +4118,8 @@ static dist_status disti_net_arrange(dist_context *ctx, dist_net *net, const cha
     net->panels = (float *)disti_alloc(ctx, net->panel_count * sizeof(float));
     if (net->code_count > 0) {
         size_t count;
-        if (!disti_size_mul((size_t)net->code_count, (size_t)net->code_size * sizeof(float), &count)) count = (size_t)-1;
+        if (!disti_size_mul((size_t)net->code_count, (size_t)net->code_size * sizeof(float), &count))
+            count = (size_t)-1;
         net->codes = (float *)disti_alloc(ctx, count);
     }
     return net->params && net->panels && (net->code_count == 0 || net->codes) ? DIST_OK : DIST_OUT_OF_MEMORY;
@@ -4132,7 +4186,8 @@ static dist_status disti_loader_bad(const disti_loader *loader, const char *key)
     for (const char *c = value ? value : ""; *c && n < 140; c++) text[n++] = *c;
     text[n++] = '"';
     text[n] = 0;
-    return disti_fail(loader->ctx, DIST_BAD_FILE, "dist_net_load: metadata %s, which is not one of the values it can have", text, 0, 0);
+    return disti_fail(loader->ctx, DIST_BAD_FILE,
+                      "dist_net_load: metadata %s, which is not one of the values it can have", text, 0, 0);
 }
 
 /* A number at **s, or failure; advances. */
@@ -4142,7 +4197,8 @@ static int disti_scan_number(const char **s, double *out)
 }
 
 /* A metadata number within [low, high]; absent: *out keeps its default. */
-static dist_status disti_loader_number(const disti_loader *loader, const char *key, double low, double high, double *out)
+static dist_status disti_loader_number(const disti_loader *loader, const char *key, double low, double high,
+                                       double *out)
 {
     const char *s = disti_archive_meta(&loader->archive, key);
     double value;
@@ -4235,7 +4291,8 @@ static dist_status disti_loader_meta(disti_loader *loader)
     if (encoding < 0) return disti_loader_bad(loader, "dist.encoding");
     if (sines < 0) return disti_loader_bad(loader, "dist.encoding.order");
     if (norm < 0) return disti_loader_bad(loader, "dist.norm");
-    if ((status = disti_loader_number(loader, "dist.encoding.levels", 0, DISTI_MAX_LEVELS, &levels)) != DIST_OK) return status;
+    if ((status = disti_loader_number(loader, "dist.encoding.levels", 0, DISTI_MAX_LEVELS, &levels)) != DIST_OK)
+        return status;
     if ((status = disti_loader_number(loader, "dist.encoding.base", 1e-6, 1e6, &base)) != DIST_OK) return status;
     if ((status = disti_loader_number(loader, "dist.encoding.raw", 0, 1, &raw)) != DIST_OK) return status;
     if ((status = disti_loader_number(loader, "dist.skip_scale", 1e-6, 1e6, &scale)) != DIST_OK) return status;
@@ -4284,24 +4341,29 @@ static dist_status disti_loader_shapes(disti_loader *loader)
     for (int k = 0; k < DISTI_MAX_LAYERS; k++) {
         const disti_tensor *w = disti_loader_weight(loader, k, &gain);
         if (!w) break;
-        if (w->rank != 2 || w->shape[0] < 1 || w->shape[1] < 1 || w->shape[0] > DISTI_MAX_WIDTH || w->shape[1] > 2 * DISTI_MAX_WIDTH)
-            return disti_fail(loader->ctx, DIST_BAD_FILE, "dist_net_load: tensor %s must be (out, in) of at most %d by %d", w->name,
+        if (w->rank != 2 || w->shape[0] < 1 || w->shape[1] < 1 || w->shape[0] > DISTI_MAX_WIDTH ||
+            w->shape[1] > 2 * DISTI_MAX_WIDTH)
+            return disti_fail(loader->ctx, DIST_BAD_FILE,
+                              "dist_net_load: tensor %s must be (out, in) of at most %d by %d", w->name,
                               DISTI_MAX_WIDTH, 2 * DISTI_MAX_WIDTH);
         net->layer[k].out = (int)w->shape[0];
         net->layer[k].in = (int)w->shape[1];
         net->layers++;
     }
     if (net->layers == 0)
-        return disti_fail(loader->ctx, DIST_BAD_FILE,
-                          "dist_net_load: no tensor is called lin0.weight, lin0.weight_v or the like (also with module. before it)",
-                          NULL, 0, 0);
+        return disti_fail(
+            loader->ctx, DIST_BAD_FILE,
+            "dist_net_load: no tensor is called lin0.weight, lin0.weight_v or the like (also with module. before it)",
+            NULL, 0, 0);
     if (net->layers == DISTI_MAX_LAYERS && disti_loader_weight(loader, DISTI_MAX_LAYERS, &gain))
-        return disti_fail(loader->ctx, DIST_UNSUPPORTED, "dist_net_load: more than %d layers", NULL, DISTI_MAX_LAYERS, 0);
+        return disti_fail(loader->ctx, DIST_UNSUPPORTED, "dist_net_load: more than %d layers", NULL, DISTI_MAX_LAYERS,
+                          0);
     size = net->layer[0].in - net->point_size;
     if (disti_loader_number(loader, "dist.code_size", 0, DISTI_MAX_WIDTH, &size) != DIST_OK) return DIST_BAD_FILE;
     if (size != (int)size || size + net->point_size != net->layer[0].in)
-        return disti_fail(loader->ctx, DIST_BAD_FILE, "dist_net_load: layer 0 takes %d numbers, but code and point have %d",
-                          NULL, net->layer[0].in, size + net->point_size);
+        return disti_fail(loader->ctx, DIST_BAD_FILE,
+                          "dist_net_load: layer 0 takes %d numbers, but code and point have %d", NULL, net->layer[0].in,
+                          size + net->point_size);
     net->code_size = (int)size;
     for (int l = 1; l < net->layers && !list; l++)
         loader->skip[l] = net->layer[l].in == net->layer[l - 1].out + net->layer[0].in;
@@ -4312,8 +4374,9 @@ static dist_status disti_loader_shapes(disti_loader *loader)
         if (*list == ',') list++;
     }
     if (net->layer[net->layers - 1].out != net->channels)
-        return disti_fail(loader->ctx, DIST_BAD_FILE, "dist_net_load: the last layer gives %d numbers, but dist.channels names %d",
-                          NULL, net->layer[net->layers - 1].out, net->channels);
+        return disti_fail(loader->ctx, DIST_BAD_FILE,
+                          "dist_net_load: the last layer gives %d numbers, but dist.channels names %d", NULL,
+                          net->layer[net->layers - 1].out, net->channels);
     clamp = net->code_size > 0 ? (double)0.1f : 0.0;
     if (disti_loader_number(loader, "dist.clamp", 0, 1e6, &clamp) != DIST_OK) return DIST_BAD_FILE;
     net->clamp = (float)clamp;
@@ -4321,24 +4384,28 @@ static dist_status disti_loader_shapes(disti_loader *loader)
 }
 
 /* Tensor -> count floats, all finite. */
-static dist_status disti_loader_read(const disti_loader *loader, const disti_tensor *tensor, const char *what, int k, size_t count, float *out)
+static dist_status disti_loader_read(const disti_loader *loader, const disti_tensor *tensor, const char *what, int k,
+                                     size_t count, float *out)
 {
     if (!tensor)
         return disti_fail(loader->ctx, DIST_BAD_FILE, "dist_net_load: tensor %s of layer %d is missing", what, k, 0);
     if (tensor->dtype == DISTI_DTYPE_OTHER)
-        return disti_fail(loader->ctx, DIST_UNSUPPORTED, "dist_net_load: tensor %s must be F32, F16 or BF16", tensor->name, 0, 0);
+        return disti_fail(loader->ctx, DIST_UNSUPPORTED, "dist_net_load: tensor %s must be F32, F16 or BF16",
+                          tensor->name, 0, 0);
     if (tensor->count != count)
-        return disti_fail(loader->ctx, DIST_BAD_FILE, "dist_net_load: tensor %s has %d numbers, must have %d", tensor->name,
-                          (double)tensor->count, (double)count);
+        return disti_fail(loader->ctx, DIST_BAD_FILE, "dist_net_load: tensor %s has %d numbers, must have %d",
+                          tensor->name, (double)tensor->count, (double)count);
     disti_tensor_read(tensor, out);
     for (size_t i = 0; i < count; i++)
         if (!disti_finite(out[i]))
-            return disti_fail(loader->ctx, DIST_NOT_FINITE, "dist_net_load: tensor %s holds %d at place %d, must be finite",
-                              tensor->name, (double)out[i], (double)i);
+            return disti_fail(loader->ctx, DIST_NOT_FINITE,
+                              "dist_net_load: tensor %s holds %d at place %d, must be finite", tensor->name,
+                              (double)out[i], (double)i);
     return DIST_OK;
 }
 
-/* Weight norm: w[o] = g[o] v[o] / |v[o]|, in double; a zero row stays zero. gain is read into the bias's place first. */
+/* Weight norm: w[o] = g[o] v[o] / |v[o]|, in double; a zero row stays zero. gain is read into the bias's place
+   first. */
 static void disti_weight_norm(size_t out, size_t in, const float *gain, float *v)
 {
     for (size_t o = 0; o < out; o++) {
@@ -4363,7 +4430,8 @@ static dist_status disti_loader_values(disti_loader *loader)
             if ((status = disti_loader_read(loader, gain, "weight_g", l, out, bias)) != DIST_OK) return status;
             disti_weight_norm(out, in, bias, w);
         }
-        if ((status = disti_loader_read(loader, disti_loader_find(loader, "lin", l, ".bias"), "bias", l, out, bias)) != DIST_OK)
+        if ((status = disti_loader_read(loader, disti_loader_find(loader, "lin", l, ".bias"), "bias", l, out, bias)) !=
+            DIST_OK)
             return status;
         if (!net->normed || l + 1 == net->layers) continue;
         if ((status = disti_loader_read(loader, disti_loader_find(loader, "norm", l, ".weight"), "norm weight", l, out,
@@ -4381,7 +4449,8 @@ static dist_status disti_loader_codes(disti_loader *loader)
     const disti_tensor *codes = disti_archive_find(&loader->archive, "codes");
     if (!codes || loader->net->code_size == 0) return DIST_OK;
     if (codes->rank != 2 || codes->shape[1] != (size_t)loader->net->code_size || codes->shape[0] > 0x7fffffffu)
-        return disti_fail(loader->ctx, DIST_BAD_FILE, "dist_net_load: tensor codes must be (n, %d)", NULL, loader->net->code_size, 0);
+        return disti_fail(loader->ctx, DIST_BAD_FILE, "dist_net_load: tensor codes must be (n, %d)", NULL,
+                          loader->net->code_size, 0);
     loader->net->code_count = (int)codes->shape[0];
     return DIST_OK;
 }
@@ -4467,7 +4536,8 @@ static void disti_saver_meta(disti_saver *s, const dist_net *net)
     s->at++;
     disti_saver_text(s, "format", "dist-net-1");
     if (net->activation == DIST_ACTIVATION_SOFTPLUS || net->activation == DIST_ACTIVATION_SINE)
-        disti_saver_number(s, "dist.activation", activations[net->activation], (double)net->first_scale, (double)net->scale, 9);
+        disti_saver_number(s, "dist.activation", activations[net->activation], (double)net->first_scale,
+                           (double)net->scale, 9);
     else
         disti_saver_text(s, "dist.activation", activations[net->activation]);
     disti_saver_text(s, "dist.output", outputs[net->output]);
@@ -4483,7 +4553,8 @@ static void disti_saver_meta(disti_saver *s, const dist_net *net)
         disti_saver_text(s, "dist.encoding.order", orders[net->order]);
     }
     disti_saver_text(s, "dist.norm", net->normed ? "layer" : "none");
-    if (net->normed) disti_saver_number(s, "dist.norm.epsilon", "", (double)net->norm_epsilon, (double)net->norm_epsilon, 9);
+    if (net->normed)
+        disti_saver_number(s, "dist.norm.epsilon", "", (double)net->norm_epsilon, (double)net->norm_epsilon, 9);
     disti_saver_number(s, "dist.level", "", (double)net->level, (double)net->level, 9);
     disti_saver_number(s, "dist.code_size", "", net->code_size, net->code_size, 6);
     disti_saver_text(s, "dist.channels", channels);
@@ -4501,7 +4572,8 @@ DIST_API dist_status dist_net_save(dist_context *ctx, const dist_net *net, void 
     size_t count = 0;
     dist_status status = disti_enter(ctx, "dist_net_save");
     if (status != DIST_OK) return status;
-    if (!net || !size) return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_net_save: %s is NULL", net ? "size" : "net", 0, 0);
+    if (!net || !size)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_net_save: %s is NULL", net ? "size" : "net", 0, 0);
     memset(tensors, 0, sizeof tensors);
     for (int l = 0; l < net->layers; l++) {
         const disti_linear *layer = &net->layer[l];
@@ -4527,7 +4599,8 @@ DIST_API dist_status dist_net_save(dist_context *ctx, const dist_net *net, void 
         tensors[count++].data = net->codes;
     }
     disti_saver_meta(&saver, net);
-    return disti_archive_write(ctx, "dist_net_save", count, tensors, saver.count, saver.keys, saver.values, buffer, capacity, size);
+    return disti_archive_write(ctx, "dist_net_save", count, tensors, saver.count, saver.keys, saver.values, buffer,
+                               capacity, size);
 }
 
 #ifndef DIST_NO_STDIO
@@ -4565,7 +4638,8 @@ static unsigned char *disti_file_read(dist_context *ctx, const char *function, c
     return bytes;
 }
 
-static dist_status disti_file_write(dist_context *ctx, const char *function, const char *path, const void *bytes, size_t size)
+static dist_status disti_file_write(dist_context *ctx, const char *function, const char *path, const void *bytes,
+                                    size_t size)
 {
     (void)function;
     FILE *file = path ? fopen(path, "wb") : NULL;
@@ -4621,7 +4695,7 @@ static double disti_normal(uint64_t *state)
 }
 
 /* PyTorch's start: uniform within 1 / sqrt(in). SIREN's: within 1 / in at first, sqrt(6 / in) / omega then.
-   Geometric (Atzmon and Lipman 2020): normal with sigma sqrt(2 / out), the last layer's mean sqrt(pi / in), bias -radius;
+   Geometric (Atzmon and Lipman 2020): normal, sigma sqrt(2 / out), the last layer's mean sqrt(pi / in), bias -radius;
    code and skipped-in columns 0, so that f starts near |p| - radius. */
 static void disti_net_randomize(dist_net *net, const dist_net_desc *desc)
 {
@@ -4638,7 +4712,8 @@ static void disti_net_randomize(dist_net *net, const dist_net_desc *desc)
                 int is_point = k >= layer->point_column && k < layer->point_column + layer->point;
                 double x = (2.0 * disti_uniform(&state) - 1.0) * range;
                 if (desc->geometric) {
-                    x = last ? sqrt(3.14159265358979 / in) + 1e-4 * disti_normal(&state) : disti_normal(&state) * sqrt(2.0 / layer->out);
+                    x = last ? sqrt(3.14159265358979 / in) + 1e-4 * disti_normal(&state)
+                             : disti_normal(&state) * sqrt(2.0 / layer->out);
                     if (is_code || (l > 0 && is_point)) x = 0.0;
                 }
                 w[k] = (float)x;
@@ -4657,14 +4732,19 @@ static dist_status disti_net_desc_check(dist_context *ctx, const dist_net_desc *
     if (d->width < 1 || d->width > 4096)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: width is %d, must be 1 to 4096", name, d->width, 0);
     if (d->skip < 0 || d->skip >= d->layers)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: skip is %d, must be 0 or a hidden layer below %d", name, d->skip, d->layers);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: skip is %d, must be 0 or a hidden layer below %d", name, d->skip,
+                          d->layers);
     if (d->code_size < 0 || d->code_size > 4096 || d->code_count < 0 || d->code_count > 10000000)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: code_size is %d, code_count %d; at most 4096 and 1e7", name, d->code_size, d->code_count);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: code_size is %d, code_count %d; at most 4096 and 1e7", name,
+                          d->code_size, d->code_count);
     if (d->activation < DIST_ACTIVATION_RELU || d->activation > DIST_ACTIVATION_NONE)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: activation is %d, must be a DIST_ACTIVATION_ constant", name, d->activation, 0);
-    if (!disti_finite(d->scale) || d->scale <= 0.0f || !disti_finite(d->bound) || d->bound <= 0.0f || !disti_finite(d->clamp) || d->clamp < 0.0f)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: scale is %d, bound %d; both, and clamp, must be finite and not negative",
-                          name, (double)d->scale, (double)d->bound);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: activation is %d, must be a DIST_ACTIVATION_ constant", name,
+                          d->activation, 0);
+    if (!disti_finite(d->scale) || d->scale <= 0.0f || !disti_finite(d->bound) || d->bound <= 0.0f ||
+        !disti_finite(d->clamp) || d->clamp < 0.0f)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT,
+                          "%s: scale is %d, bound %d; both, and clamp, must be finite and not negative", name,
+                          (double)d->scale, (double)d->bound);
     return DIST_OK;
 }
 
@@ -4694,7 +4774,8 @@ DIST_API dist_net *dist_net_create(dist_context *ctx, const dist_net_desc *desc)
     net->code_size = d.code_size;
     net->code_count = d.code_size > 0 ? d.code_count : 0;
     net->activation = d.activation;
-    if (d.activation == DIST_ACTIVATION_SOFTPLUS || d.activation == DIST_ACTIVATION_SINE) net->first_scale = net->scale = d.scale;
+    if (d.activation == DIST_ACTIVATION_SOFTPLUS || d.activation == DIST_ACTIVATION_SINE)
+        net->first_scale = net->scale = d.scale;
     net->output = d.output_linear ? DISTI_OUTPUT_NONE : DISTI_OUTPUT_TANH;
     net->bound = d.bound;
     net->clamp = d.clamp;
@@ -4721,8 +4802,8 @@ DIST_API dist_status dist_net_set_weights(dist_context *ctx, dist_net *net, cons
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_net_set_weights: %s is NULL", net ? "weights" : "net", 0, 0);
     for (size_t i = 0; i < net->param_count; i++)
         if (!disti_finite(weights[i]))
-            return disti_fail(ctx, DIST_NOT_FINITE, "dist_net_set_weights: weights[%d] is %d, must be finite", NULL, (double)i,
-                              (double)weights[i]);
+            return disti_fail(ctx, DIST_NOT_FINITE, "dist_net_set_weights: weights[%d] is %d, must be finite", NULL,
+                              (double)i, (double)weights[i]);
     memcpy(net->params, weights, net->param_count * sizeof(float));
     disti_net_pack(net);
     return DIST_OK;
@@ -4733,8 +4814,9 @@ DIST_API dist_status dist_net_set_code(dist_context *ctx, dist_net *net, int ind
     dist_status status = disti_enter(ctx, "dist_net_set_code");
     if (status != DIST_OK) return status;
     if (!net || !code || index < 0 || index >= net->code_count)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_net_set_code: index is %d of %d codes; net and code must not be NULL", NULL,
-                          index, net ? net->code_count : 0);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT,
+                          "dist_net_set_code: index is %d of %d codes; net and code must not be NULL", NULL, index,
+                          net ? net->code_count : 0);
     if (!disti_finite_all((size_t)net->code_size, code))
         return disti_fail(ctx, DIST_NOT_FINITE, "dist_net_set_code: code must be finite", NULL, 0, 0);
     memcpy(net->codes + (size_t)index * (size_t)net->code_size, code, (size_t)net->code_size * sizeof(float));
@@ -4742,7 +4824,7 @@ DIST_API dist_status dist_net_set_code(dist_context *ctx, dist_net *net, int ind
 }
 #endif
 
-/*@ 06 camera -------------------------------------------------------------------------------------------------------------- */
+/*@ 06 camera ------------------------------------------------------------------------------------------------------- */
 
 /* b = M a and b = M^T a, 3 x 3 row-major. */
 static void disti_rotate(const double m[9], const double a[3], double b[3])
@@ -4825,13 +4907,16 @@ static dist_status disti_camera_check(dist_context *ctx, const dist_camera *came
 {
     if (!camera) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: camera is NULL", function, 0, 0);
     if (camera->width < 1 || camera->width > 65536 || camera->height < 1 || camera->height > 65536)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: camera is %d x %d pixels, each side must be 1 to 65536", function,
-                          camera->width, camera->height);
-    if (!disti_finite(camera->fx) || !disti_finite(camera->fy) || !(camera->fx * camera->fx > 0.0f) || !(camera->fy * camera->fy > 0.0f))
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: camera is %d x %d pixels, each side must be 1 to 65536",
+                          function, camera->width, camera->height);
+    if (!disti_finite(camera->fx) || !disti_finite(camera->fy) || !(camera->fx * camera->fx > 0.0f) ||
+        !(camera->fy * camera->fy > 0.0f))
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: camera.fx is %d, fy %d; must be finite and not 0", function,
                           (double)camera->fx, (double)camera->fy);
-    if (!disti_finite(camera->cx) || !disti_finite(camera->cy) || !disti_finite(camera->skew) || !disti_finite(camera->pixel_center))
-        return disti_fail(ctx, DIST_NOT_FINITE, "%s: camera.cx, cy, skew and pixel_center must be finite", function, 0, 0);
+    if (!disti_finite(camera->cx) || !disti_finite(camera->cy) || !disti_finite(camera->skew) ||
+        !disti_finite(camera->pixel_center))
+        return disti_fail(ctx, DIST_NOT_FINITE, "%s: camera.cx, cy, skew and pixel_center must be finite", function, 0,
+                          0);
     if (!disti_finite_all(9, camera->rotation) || !disti_finite_all(3, camera->translation))
         return disti_fail(ctx, DIST_NOT_FINITE, "%s: camera.rotation and translation must be finite", function, 0, 0);
     double m[9], c[3], worst = 0.0;
@@ -4844,9 +4929,10 @@ static dist_status disti_camera_check(dist_context *ctx, const dist_camera *came
     }
     disti_cross(m, m + 3, c);
     if (worst > 1e-3 || disti_dot(c, m + 6) < 0.0)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT,
-                          "%s: camera.rotation is not a rotation (rows off orthonormal by %d, determinant %d); see dist_camera_move",
-                          function, worst, disti_dot(c, m + 6));
+        return disti_fail(
+            ctx, DIST_BAD_ARGUMENT,
+            "%s: camera.rotation is not a rotation (rows off orthonormal by %d, determinant %d); see dist_camera_move",
+            function, worst, disti_dot(c, m + 6));
     return DIST_OK;
 }
 
@@ -4859,7 +4945,8 @@ static void disti_camera_place(dist_camera *camera, const double m[9], const dou
     for (int i = 0; i < 3; i++) camera->translation[i] = (float)-t[i];
 }
 
-DIST_API dist_camera dist_camera_look_at(int width, int height, float fov_y, const float eye[3], const float at[3], const float up[3])
+DIST_API dist_camera dist_camera_look_at(int width, int height, float fov_y, const float eye[3], const float at[3],
+                                         const float up[3])
 {
     dist_camera camera;
     double m[9], center[3], down[3] = {0.0, -1.0, 0.0};
@@ -4906,7 +4993,8 @@ DIST_API void dist_camera_get_opengl(const dist_camera *camera, float camera_to_
     if (!camera || !camera_to_world) return;
     disti_view_of(camera, &view);
     for (int i = 0; i < 3; i++) {
-        for (int j = 0; j < 3; j++) camera_to_world[4 * j + i] = (float)(view.rotation[3 * i + j] * (i == 0 ? 1.0 : -1.0));
+        for (int j = 0; j < 3; j++)
+            camera_to_world[4 * j + i] = (float)(view.rotation[3 * i + j] * (i == 0 ? 1.0 : -1.0));
         camera_to_world[4 * i + 3] = (float)view.center[i];
     }
 }
@@ -4920,8 +5008,9 @@ DIST_API dist_status dist_camera_set_colmap(dist_camera *camera, const float qua
     if (!(length > 1e-30)) return DIST_BAD_ARGUMENT;
     for (int i = 0; i < 4; i++) q[i] = (double)quaternion[i] / sqrt(length);
     double w = q[0], x = q[1], y = q[2], z = q[3];
-    double m[9] = {1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), 2 * (x * y + w * z), 1 - 2 * (x * x + z * z),
-                   2 * (y * z - w * x), 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)};
+    double m[9] = {1 - 2 * (y * y + z * z), 2 * (x * y - w * z),     2 * (x * z + w * y),
+                   2 * (x * y + w * z),     1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+                   2 * (x * z - w * y),     2 * (y * z + w * x),     1 - 2 * (x * x + y * y)};
     for (int i = 0; i < 9; i++) camera->rotation[i] = (float)m[i];
     memcpy(camera->translation, translation, sizeof camera->translation);
     camera->pixel_center = 0.5f;
@@ -4967,7 +5056,8 @@ DIST_API void dist_camera_move(dist_camera *camera, const float w[3], const floa
                        b * v[0] * v[2] - a * v[1], b * v[1] * v[2] + a * v[0], c + b * v[2] * v[2]};
         for (int i = 0; i < 9; i++) m[i] = (double)camera->rotation[i];
         for (int i = 0; i < 3; i++)
-            for (int j = 0; j < 3; j++) r[3 * i + j] = e[3 * i] * m[j] + e[3 * i + 1] * m[3 + j] + e[3 * i + 2] * m[6 + j];
+            for (int j = 0; j < 3; j++)
+                r[3 * i + j] = e[3 * i] * m[j] + e[3 * i + 1] * m[3 + j] + e[3 * i + 2] * m[6 + j];
         disti_orthonormalize(r);
         for (int i = 0; i < 9; i++) camera->rotation[i] = (float)r[i];
     }
@@ -4988,15 +5078,16 @@ DIST_API void dist_camera_ray(const dist_camera *camera, float x, float y, float
     }
 }
 
-/*@ 07 trace --------------------------------------------------------------------------------------------------------------- */
+/*@ 07 trace -------------------------------------------------------------------------------------------------------- */
 
-/* A ray in the field's space, p(s) = origin + s direction, with origin the point closest to the bounding sphere's center,
-   so that s stays within the radius however far the camera is; distance along the ray = base + s. */
+/* A ray in the field's space, p(s) = origin + s direction, with origin the point closest to the bounding sphere's
+   center, so that s stays within the radius however far the camera is; distance along the ray = base + s. */
 typedef struct disti_ray {
     double base;
     float origin[3], direction[3];
     float enter, leave; /* of the bounding sphere, not before the camera; enter >= leave: it is not met */
-    float footprint;    /* half a pixel's width at unit distance: t cos^2 / (2 f)                       (paper, supplement) */
+    float footprint;    /* half a pixel's width at unit distance, cos^2 / (2 f)                     (paper,
+    supplement) */
     float q;            /* where f is wanted next */
     float s, f;         /* front: nothing lies before it */
     float slope;        /* df/ds of the last two samples */
@@ -5008,7 +5099,8 @@ typedef struct disti_ray {
     unsigned short steps;
     unsigned char mode, status;
     unsigned char side; /* bracket: queries since its width was noted; band: queries in it */
-    unsigned char moved; /* bracket: its end that moved last, 1 b, 2 a, 3 b twice; band: 1 if the ray came into it from outside */
+    unsigned char
+        moved; /* bracket: its end that moved last, 1 b, 2 a, 3 b twice; band: 1 if the ray came into it from outside */
 } disti_ray;
 
 enum { DISTI_DONE, DISTI_FIRST, DISTI_MARCH, DISTI_JUMP, DISTI_BACK, DISTI_BAND, DISTI_BRACKET, DISTI_CONES };
@@ -5030,7 +5122,8 @@ DIST_API dist_render_desc dist_render_desc_resolve(const dist_render_desc *desc)
     if (how.step_scale == 0.0f) how.step_scale = 1.5f;
     if (how.epsilon == 0.0f && how.trace == DIST_TRACE_PAPER) how.epsilon = 5e-5f;
     if (how.samples == 0) how.samples = 1;
-    if (how.gradient == DIST_GRADIENT_AUTO) how.gradient = how.trace == DIST_TRACE_PAPER ? DIST_GRADIENT_PAPER : DIST_GRADIENT_NORMAL;
+    if (how.gradient == DIST_GRADIENT_AUTO)
+        how.gradient = how.trace == DIST_TRACE_PAPER ? DIST_GRADIENT_PAPER : DIST_GRADIENT_NORMAL;
     if (how.gradient_cap == 0.0f) how.gradient_cap = 0.1f;
     if (how.normal_delta == 0.0f) how.normal_delta = 1e-3f;
     return how;
@@ -5053,33 +5146,52 @@ static dist_status disti_how_check(dist_context *ctx, const dist_render_desc *ho
     if ((status = disti_choice(ctx, function, "max_steps", how->max_steps, 60000)) != DIST_OK) return status;
     if ((status = disti_choice(ctx, function, "samples", how->samples, 8)) != DIST_OK) return status;
     if ((status = disti_choice(ctx, function, "trace", how->trace, DIST_TRACE_PAPER)) != DIST_OK) return status;
-    if ((status = disti_choice(ctx, function, "paper_row", how->paper_row, DIST_PAPER_PARALLEL)) != DIST_OK) return status;
-    if ((status = disti_choice(ctx, function, "gradient", how->gradient, DIST_GRADIENT_PAPER)) != DIST_OK) return status;
-    if ((status = disti_choice(ctx, function, "normal_mode", how->normal_mode, DIST_NORMAL_DIFFERENCE)) != DIST_OK) return status;
-    if ((status = disti_choice(ctx, function, "normal_space", how->normal_space, DIST_SPACE_WORLD)) != DIST_OK) return status;
+    if ((status = disti_choice(ctx, function, "paper_row", how->paper_row, DIST_PAPER_PARALLEL)) != DIST_OK)
+        return status;
+    if ((status = disti_choice(ctx, function, "gradient", how->gradient, DIST_GRADIENT_PAPER)) != DIST_OK)
+        return status;
+    if ((status = disti_choice(ctx, function, "normal_mode", how->normal_mode, DIST_NORMAL_DIFFERENCE)) != DIST_OK)
+        return status;
+    if ((status = disti_choice(ctx, function, "normal_space", how->normal_space, DIST_SPACE_WORLD)) != DIST_OK)
+        return status;
     if ((status = disti_choice(ctx, function, "inside", how->inside, DIST_INSIDE_EXIT)) != DIST_OK) return status;
     if ((status = disti_choice(ctx, function, "no_cones", how->no_cones, 1)) != DIST_OK) return status;
     if (!disti_finite(how->step_scale) || how->step_scale < 0.0f || how->step_scale > 100.0f)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.step_scale is %d, must be above 0 (0: the default) and at most 100", function, (double)how->step_scale, 0);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT,
+                          "%s: how.step_scale is %d, must be above 0 (0: the default) and at most 100", function,
+                          (double)how->step_scale, 0);
     if (!disti_finite(how->epsilon) || how->epsilon < 0.0f)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.epsilon is %d, must be 0 or positive", function, (double)how->epsilon, 0);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.epsilon is %d, must be 0 or positive", function,
+                          (double)how->epsilon, 0);
     if (!disti_finite(how->gradient_cap) || how->gradient_cap < 0.0f || how->gradient_cap > 1.0f)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.gradient_cap is %d, must be 0 to 1", function, (double)how->gradient_cap, 0);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.gradient_cap is %d, must be 0 to 1", function,
+                          (double)how->gradient_cap, 0);
     if (!disti_finite(how->normal_delta) || how->normal_delta < 0.0f)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.normal_delta is %d, must be 0 or positive", function, (double)how->normal_delta, 0);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.normal_delta is %d, must be 0 or positive", function,
+                          (double)how->normal_delta, 0);
     if (!disti_finite(how->lipschitz) || how->lipschitz < 0.0f)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.lipschitz is %d, must be 0 or positive", function, (double)how->lipschitz, 0);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.lipschitz is %d, must be 0 or positive", function,
+                          (double)how->lipschitz, 0);
     if (!disti_finite(how->background) || !disti_finite_all(3, how->background_color))
-        return disti_fail(ctx, DIST_NOT_FINITE, "%s: how.background and background_color must be finite", function, 0, 0);
+        return disti_fail(ctx, DIST_NOT_FINITE, "%s: how.background and background_color must be finite", function, 0,
+                          0);
 #ifdef DIST_NO_PAPER
     if (how->trace == DIST_TRACE_PAPER)
-        return disti_fail(ctx, DIST_UNSUPPORTED, "%s: this build has DIST_NO_PAPER, so no DIST_TRACE_PAPER", function, 0, 0);
+        return disti_fail(ctx, DIST_UNSUPPORTED, "%s: this build has DIST_NO_PAPER, so no DIST_TRACE_PAPER", function,
+                          0, 0);
 #endif
     return DIST_OK;
 }
 
-static dist_status disti_tracer_init(disti_tracer *tracer, dist_context *ctx, const dist_field *field, const dist_render_desc *desc,
-                                     const char *function)
+/* alpha of a paper row: the two plain ones step by f itself. */
+static float disti_paper_alpha(const dist_render_desc *how)
+{
+    return how->paper_row == DIST_PAPER_COARSE_TO_FINE || how->paper_row == DIST_PAPER_AGGRESSIVE ? how->step_scale
+                                                                                                  : 1.0f;
+}
+
+static dist_status disti_tracer_init(disti_tracer *tracer, dist_context *ctx, const dist_field *field,
+                                     const dist_render_desc *desc, const char *function)
 {
     dist_render_desc raw;
     memset(&raw, 0, sizeof raw);
@@ -5090,15 +5202,18 @@ static dist_status disti_tracer_init(disti_tracer *tracer, dist_context *ctx, co
     tracer->field = field;
     tracer->how = dist_render_desc_resolve(desc);
     if (!desc || desc->normal_delta == 0.0f) tracer->how.normal_delta = 1e-3f * field->radius;
-    tracer->lipschitz = tracer->how.lipschitz > 0.0f ? tracer->how.lipschitz : field->lipschitz > 0.0f ? field->lipschitz : 1.0f;
+    tracer->lipschitz = tracer->how.lipschitz > 0.0f ? tracer->how.lipschitz
+                        : field->lipschitz > 0.0f    ? field->lipschitz
+                                                     : 1.0f;
     tracer->noise = 5e-7f * field->radius;
     tracer->epsilon = DISTI_MAX(tracer->how.epsilon, tracer->how.epsilon > 0.0f ? tracer->noise : 0.0f);
     return DIST_OK;
 }
 
-/* center and direction (unit) of the ray in the field's space. The closest approach is found in double: a float's squared
-   distance is off by more than epsilon from 30 radii on. */
-static void disti_ray_init(const dist_field *field, const double center[3], const double direction[3], double footprint, disti_ray *ray)
+/* center and direction (unit) of the ray in the field's space. The closest approach is found in double: a float's
+   squared distance is off by more than epsilon from 30 radii on. */
+static void disti_ray_init(const dist_field *field, const double center[3], const double direction[3], double footprint,
+                           disti_ray *ray)
 {
     double c[3], square = 0.0, radius = (double)field->radius;
     memset(ray, 0, sizeof *ray);
@@ -5152,8 +5267,9 @@ static int disti_ray_ask(disti_ray *ray, int mode, float q)
     return 1;
 }
 
-/* Bracket [a, b], fa > 0 >= fb: regula falsi with Illinois' halving of the end that stays; a bisection whenever three queries
-   did not halve it. So slope, clamp and kinks cannot make it oscillate, and equal ends cannot divide by 0. */
+/* Bracket [a, b], fa > 0 >= fb: regula falsi with Illinois' halving of the end that stays; a bisection whenever
+   three queries did not halve it. So slope, clamp and kinks cannot make it oscillate, and equal ends cannot divide
+      by 0. */
 static int disti_ray_bracket(const disti_tracer *tracer, disti_ray *ray)
 {
     float width = ray->b - ray->a;
@@ -5161,7 +5277,8 @@ static int disti_ray_bracket(const disti_tracer *tracer, disti_ray *ray)
     float spacing = 2.4e-7f * tracer->field->radius; /* s has no finer steps */
     float q = ray->a + width * (ray->fa / (ray->fa - ray->fb));
     if (width <= DISTI_MAX(tolerance, spacing)) return disti_ray_end(ray, DIST_RAY_HIT, q, 0.0f, width);
-    int lopsided = ray->moved == 3 && -ray->fb < 0.01f * ray->fa && width > 64.0f * tolerance; /* f is flat beyond: regula falsi would crawl */
+    int lopsided = ray->moved == 3 && -ray->fb < 0.01f * ray->fa &&
+                   width > 64.0f * tolerance; /* f is flat beyond: regula falsi would crawl */
     if (lopsided || (ray->side >= 3 && width > 0.5f * ray->width)) {
         q = 0.5f * (ray->a + ray->b);
         ray->side = 0;
@@ -5212,23 +5329,24 @@ static int disti_ray_open_bracket(const disti_tracer *tracer, disti_ray *ray, fl
     return disti_ray_bracket(tracer, ray);
 }
 
-/* Steps no shorter than this are taken along a surface that the ray hardly approaches. They grow from the 20th query on, so
-   that a plateau of f ends within the budget. */
+/* Steps no shorter than this are taken along a surface that the ray hardly approaches. They grow from the 20th query
+   on, so that a plateau of f ends within the budget. */
 static float disti_ray_floor(const disti_tracer *tracer, const disti_ray *ray)
 {
     float patience = ray->steps > 20 ? 1.0f + 0.1f * (float)(ray->steps - 20) : 1.0f;
     return 5e-4f * patience * tracer->field->radius;
 }
 
-/* Where to look next from the front: near the surface a jump to where the last slope says that f ends, at most three spheres
-   far; else a sphere step, stretched by what the slope allows: for a plane that recedes or comes at the angle seen,
-   2 / (1 - slope) (auto-relaxation). What is found there is checked on arrival. */
+/* Where to look next from the front: near the surface a jump to where the last slope says that f ends, at most three
+   spheres far; else a sphere step, stretched by what the slope allows: for a plane that recedes or comes at the
+   angle seen, 2 / (1 - slope) (auto-relaxation). What is found there is checked on arrival. */
 static int disti_ray_step(const disti_tracer *tracer, disti_ray *ray)
 {
     float radius = ray->f / tracer->lipschitz;
     float epsilon = disti_ray_epsilon(tracer, ray, ray->s);
     float slope = ray->slope / tracer->lipschitz;
-    if (ray->s + radius >= ray->leave) return disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest * ray->sign, 0.0f);
+    if (ray->s + radius >= ray->leave)
+        return disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest * ray->sign, 0.0f);
     float stretch = ray->steps < 2 ? tracer->how.step_scale : DISTI_MAX(1.0f, 2.0f / (1.0f - DISTI_MIN(slope, 0.75f)));
     float step = radius * DISTI_MIN(stretch, 8.0f);
     int mode = DISTI_MARCH;
@@ -5244,8 +5362,8 @@ static int disti_ray_step(const disti_tracer *tracer, disti_ray *ray)
     return disti_ray_ask(ray, mode, DISTI_MIN(q, ray->leave));
 }
 
-/* A step that the spheres of radius f / L at its two ends do not cover is taken back, unless it is too short to matter or it
-   followed a surface at a low angle and found f about where the slope said. */
+/* A step that the spheres of radius f / L at its two ends do not cover is taken back, unless it is too short to
+   matter or it followed a surface at a low angle and found f about where the slope said. */
 static int disti_ray_trusts(const disti_tracer *tracer, const disti_ray *ray, float f, float step)
 {
     if (ray->slope > -0.3f * tracer->lipschitz && step <= 1.001f * disti_ray_floor(tracer, ray)) return 1;
@@ -5265,22 +5383,25 @@ static int disti_ray_feel(const disti_tracer *tracer, disti_ray *ray, float epsi
     return disti_ray_ask(ray, DISTI_BAND, DISTI_MIN(q, ray->leave));
 }
 
-/* f < epsilon at the front without a crossing yet: it is a hit by the paper's rule, but a crossing close by is a better one.
-   Leaving the band again (by 4 epsilon) was a touch: a hit at its least f, unless the ray began there (no hit with the surface it starts
-   from). f that does not change at all is a plateau. The band's first sample stands in a, fa, its least in b, fb. */
+/* f < epsilon at the front without a crossing yet: it is a hit by the paper's rule, but a crossing close by is a
+   better one. Leaving the band again (by 4 epsilon) was a touch: a hit at its least f, unless the ray began there
+   (no hit with the surface it starts from). f that does not change at all is a plateau. The band's first sample
+   stands in a, fa, its least in b, fb. */
 static int disti_ray_band(const disti_tracer *tracer, disti_ray *ray, float f)
 {
     float epsilon = disti_ray_epsilon(tracer, ray, ray->s);
     float slope = (f - ray->f) / DISTI_MAX(ray->q - ray->s, 1e-30f);
     if (f <= 0.0f && ray->f > 0.0f) return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->q, f);
-    if (f < 0.0f) return disti_ray_end(ray, DIST_RAY_HIT, ray->s, 0.0f, 0.0f); /* the start is the surface, to the last bit */
+    if (f < 0.0f)
+        return disti_ray_end(ray, DIST_RAY_HIT, ray->s, 0.0f, 0.0f); /* the start is the surface, to the last bit */
     ray->side++;
     if (f < ray->fb) {
         ray->b = ray->q;
         ray->fb = f;
     }
     if (f >= 4.0f * epsilon || ray->q >= ray->leave) {
-        if (ray->moved) return disti_ray_end(ray, DIST_RAY_HIT, ray->b, ray->fb, ray->fb / tracer->lipschitz + (ray->q - ray->a));
+        if (ray->moved)
+            return disti_ray_end(ray, DIST_RAY_HIT, ray->b, ray->fb, ray->fb / tracer->lipschitz + (ray->q - ray->a));
         ray->s = ray->q;
         ray->f = f;
         ray->slope = slope;
@@ -5355,7 +5476,8 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
         if (f <= 0.0f) return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, q, f);
         float radius = ray->f / tracer->lipschitz, step = q - ray->s;
         float spacing = 4.8e-7f * tracer->field->radius;
-        if (step > radius + f / tracer->lipschitz && step > 1.0001f * radius + spacing && !disti_ray_trusts(tracer, ray, f, step)) {
+        if (step > radius + f / tracer->lipschitz && step > 1.0001f * radius + spacing &&
+            !disti_ray_trusts(tracer, ray, f, step)) {
             float slope = (f - ray->f) / step;
             ray->slope = DISTI_MAX(slope, -tracer->lipschitz);
             return disti_ray_ask(ray, DISTI_MARCH, DISTI_MIN(ray->s + DISTI_MAX(radius, spacing), ray->leave));
@@ -5417,7 +5539,8 @@ static void disti_trace_rounds(const disti_tracer *tracer, int worker, const dis
         if (bench->rays[i].mode != DISTI_DONE) bench->index[active++] = (int)i;
     while (active > 0) {
         size_t kept = 0;
-        for (size_t i = 0; i < active; i++) disti_ray_point(&bench->rays[bench->index[i]], bench->rays[bench->index[i]].q, bench->points + 3 * i);
+        for (size_t i = 0; i < active; i++)
+            disti_ray_point(&bench->rays[bench->index[i]], bench->rays[bench->index[i]].q, bench->points + 3 * i);
         tracer->field->eval_fn(tracer->field->user, worker, active, bench->points, bench->sdf, NULL);
         bench->stats->queries += active;
         for (size_t i = 0; i < active; i++) {
@@ -5515,8 +5638,8 @@ static void disti_free_task(void *arg, int index, int worker)
             o[k] = (double)job->origins[3 * (first + i) + k];
             d[k] = (double)job->directions[3 * (first + i) + k];
         }
-        int good = disti_finite_all(3, job->origins + 3 * (first + i)) && disti_finite_all(3, job->directions + 3 * (first + i)) &&
-                   disti_normalize(d);
+        int good = disti_finite_all(3, job->origins + 3 * (first + i)) &&
+                   disti_finite_all(3, job->directions + 3 * (first + i)) && disti_normalize(d);
         if (!good) o[0] = o[1] = o[2] = d[0] = d[1] = d[2] = 0.0;
         disti_ray_init(job->tracer->field, o, d, 0.0, &bench.rays[i]);
         if (!good) disti_ray_end(&bench.rays[i], DIST_RAY_NOT_FINITE, 0.0f, 0.0f, 0.0f);
@@ -5533,8 +5656,8 @@ static void disti_free_task(void *arg, int index, int worker)
     }
 }
 
-DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size_t n, const float *origins, const float *directions,
-                                const dist_render_desc *how, dist_hit *hits, dist_stats *stats)
+DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size_t n, const float *origins,
+                                const float *directions, const dist_render_desc *how, dist_hit *hits, dist_stats *stats)
 {
     disti_tracer tracer;
     disti_free_job job;
@@ -5544,7 +5667,8 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
     if (status != DIST_OK) return status;
     if (n > 0 && (!origins || !directions || !hits))
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_trace: origins, directions or hits is NULL", NULL, 0, 0);
-    if (n > (size_t)1 << 40) return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_trace: n is %d, at most 2^40", NULL, (double)n, 0);
+    if (n > (size_t)1 << 40)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_trace: n is %d, at most 2^40", NULL, (double)n, 0);
     disti_stats_begin(ctx);
     job.tracer = &tracer;
     job.n = n;
@@ -5556,9 +5680,9 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
     return DIST_OK;
 }
 
-/* Cones: a block of pixels marches as one while the sphere that f / L proves empty is wider than the block's cone there; then
-   its children start where it stopped. Safe for anything, however thin, under the Lipschitz bound: every point of every ray of
-   the block before the stop lies in one of the empty spheres. */
+/* Cones: a block of pixels marches as one while the sphere that f / L proves empty is wider than the block's cone
+   there; then its children start where it stopped. Safe for anything, however thin, under the Lipschitz bound: every
+   point of every ray of the block before the stop lies in one of the empty spheres. */
 typedef struct disti_cone {
     disti_ray axis;
     double enter, leave; /* along any of the block's rays, measured from the camera */
@@ -5575,7 +5699,8 @@ typedef struct disti_tile {
     int x, y, width, height; /* in the picture; width and height at most DISTI_TILE */
 } disti_tile;
 
-static void disti_cone_init(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench, disti_cone *cone)
+static void disti_cone_init(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench,
+                            disti_cone *cone)
 {
     int x1 = DISTI_MIN(cone->x + cone->size, tile->width) - 1, y1 = DISTI_MIN(cone->y + cone->size, tile->height) - 1;
     double axis[3], corner[3], world[3], widest = 0.0;
@@ -5608,7 +5733,8 @@ static int disti_cone_advance(const disti_tracer *tracer, disti_cone *cone, floa
 {
     cone->blocked = 1;
     if (!disti_finite(f)) return 0;
-    double radius = ((double)f - (double)(tracer->epsilon > 0.0f ? tracer->epsilon : 5e-5f * tracer->field->radius)) / (double)tracer->lipschitz;
+    double radius = ((double)f - (double)(tracer->epsilon > 0.0f ? tracer->epsilon : 5e-5f * tracer->field->radius)) /
+                    (double)tracer->lipschitz;
     double wide = cone->t * cone->sine;
     if (radius < 1.05 * cone->t * cone->chord || radius <= wide) return 0;
     double t = cone->t * cone->cosine + sqrt(radius * radius - wide * wide);
@@ -5635,10 +5761,15 @@ static void disti_cone_finish(const disti_tile *tile, const disti_bench *bench, 
     }
 }
 
-enum { DISTI_CONE_FIRST = 32, DISTI_CONE_LEAF = 4, DISTI_CONES_MOST = (DISTI_TILE / DISTI_CONE_LEAF) * (DISTI_TILE / DISTI_CONE_LEAF) };
+enum {
+    DISTI_CONE_FIRST = 32,
+    DISTI_CONE_LEAF = 4,
+    DISTI_CONES_MOST = (DISTI_TILE / DISTI_CONE_LEAF) * (DISTI_TILE / DISTI_CONE_LEAF)
+};
 
 /* Marches one level's cones to their stops, all of them in packed rounds. */
-static void disti_cone_rounds(const disti_tracer *tracer, int worker, const disti_bench *bench, disti_cone *cones, int count)
+static void disti_cone_rounds(const disti_tracer *tracer, int worker, const disti_bench *bench, disti_cone *cones,
+                              int count)
 {
     size_t active = 0;
     for (int i = 0; i < count; i++) {
@@ -5655,7 +5786,8 @@ static void disti_cone_rounds(const disti_tracer *tracer, int worker, const dist
         bench->stats->queries += active;
         bench->stats->cone_queries += active;
         for (size_t i = 0; i < active; i++)
-            if (disti_cone_advance(tracer, &cones[bench->index[i]], bench->sdf[i]) && round < 64) bench->index[kept++] = bench->index[i];
+            if (disti_cone_advance(tracer, &cones[bench->index[i]], bench->sdf[i]) && round < 64)
+                bench->index[kept++] = bench->index[i];
         active = kept;
     }
 }
@@ -5701,10 +5833,11 @@ static void disti_cones(const disti_tracer *tracer, int worker, const disti_tile
     }
 }
 
-/* Soft silhouette of the rays that miss: min |f| along each. Cones and stretched steps leave no sample near the minimum, so it
-   is looked for: one ray of each 4 x 4 block that has no sample samples its whole length; its neighbors start at the
-   distance found there; then every ray fits a parabola through three samples around its best one. A value off by ds costs
-   ds^2 / 2 times the curvature: first-order exact                                                  (envelope theorem) */
+/* Soft silhouette of the rays that miss: min |f| along each. Cones and stretched steps leave no sample near the
+   minimum, so it is looked for: one ray of each 4 x 4 block that has no sample samples its whole length; its
+   neighbors start at the distance found there; then every ray fits a parabola through three samples around its best
+   one. A value off by ds costs ds^2 / 2 times the curvature: first-order exact                                      
+               (envelope theorem) */
 static int disti_wants_minimum(const disti_ray *ray)
 {
     return ray->status == DIST_RAY_MISS && ray->enter < ray->leave;
@@ -5738,8 +5871,10 @@ static float disti_parabola(float h, float left, float middle, float right)
 
 enum { DISTI_PROBES = 8 };
 
-/* For each 4 x 4 block whose missing rays have no sample: probe one ray; leaves the distance from the camera in t[block]. */
-static void disti_silhouette_probe(const disti_tracer *tracer, int worker, const disti_tile *tile, const disti_bench *bench, double *t)
+/* For each 4 x 4 block whose missing rays have no sample: probe one ray; leaves the distance from the camera in
+   t[block]. */
+static void disti_silhouette_probe(const disti_tracer *tracer, int worker, const disti_tile *tile,
+                                   const disti_bench *bench, double *t)
 {
     int across = (tile->width + 3) / 4, blocks = across * ((tile->height + 3) / 4);
     size_t probes = 0;
@@ -5792,7 +5927,8 @@ static void disti_silhouette(const disti_tracer *tracer, int worker, const disti
         bench->index[count++] = i;
     }
     disti_silhouette_eval(tracer, worker, bench, count);
-    for (size_t k = 0; k < count; k++) disti_keep_least(&bench->rays[bench->index[k]], bench->rays[bench->index[k]].q, bench->sdf[k]);
+    for (size_t k = 0; k < count; k++)
+        disti_keep_least(&bench->rays[bench->index[k]], bench->rays[bench->index[k]].q, bench->sdf[k]);
     for (int round = 0; round < 3; round++) { /* left, right, and where the parabola is least */
         count = 0;
         for (int i = 0; i < n; i++) {
@@ -5805,7 +5941,9 @@ static void disti_silhouette(const disti_tracer *tracer, int worker, const disti
                 ray->fa = ray->fbest;
                 if (!(ray->width > 0.0f)) continue;
             }
-            float ds = round == 0 ? -ray->width : round == 1 ? ray->width : disti_parabola(ray->width, ray->b, ray->fa, ray->fb);
+            float ds = round == 0   ? -ray->width
+                       : round == 1 ? ray->width
+                                    : disti_parabola(ray->width, ray->b, ray->fa, ray->fb);
             ray->q = DISTI_MIN(DISTI_MAX(ray->a + ds, ray->enter), ray->leave);
             disti_ray_point(ray, ray->q, bench->points + 3 * count);
             bench->index[count++] = i;
@@ -5822,10 +5960,11 @@ static void disti_silhouette(const disti_tracer *tracer, int worker, const disti
 
 #ifndef DIST_NO_PAPER
 /* The paper's tracer as its authors' code runs it, so that Table 1 can be measured row by row and gradients compared:
-     t <- t + alpha clamp(f, 0.1)   from the unit sphere on;   the sample of smallest |f| of the whole ray gives the distance,
-     t_k + clamp(f_k);   hit: t before the exit and smallest |f| <= epsilon and, without coarse-to-fine, first f > epsilon.
-   Coarse-to-fine starts with a ray for each 4 x 4, then 2 x 2 pixels, three steps each; children go on at their parent's
-   distance and inherit its samples, although those do not lie on the child's ray. 0.1 is 0.1 radii here. */
+     t <- t + alpha clamp(f, 0.1) from the unit sphere on;   the sample of smallest |f| of the whole ray gives the
+     distance, t_k + clamp(f_k);   hit: t before the exit and smallest |f| <= epsilon and, without coarse-to-fine,
+     first f > epsilon.
+   Coarse-to-fine starts with a ray for each 4 x 4, then 2 x 2 pixels, three steps each; children go on at their
+   parent's distance and inherit its samples, although those do not lie on the child's ray. 0.1 is 0.1 radii here. */
 typedef struct disti_paper_ray {
     disti_ray ray;
     float samples[8 * 4]; /* f and point of the K samples of smallest |f|, ascending */
@@ -5858,7 +5997,8 @@ static float disti_clamp(float f, float limit)
 }
 
 /* One query's worth of marching. ray->s: t; f: last f; a: first f of the finest level; fa: smallest |f| there. */
-static void disti_paper_step(const disti_tracer *tracer, disti_ray *ray, float *samples, float alpha, float f, const float *p)
+static void disti_paper_step(const disti_tracer *tracer, disti_ray *ray, float *samples, float alpha, float f,
+                             const float *p)
 {
     float magnitude = f < 0.0f ? -f : f;
     disti_keep_least(ray, ray->s, f);
@@ -5871,7 +6011,8 @@ static void disti_paper_step(const disti_tracer *tracer, disti_ray *ray, float *
 }
 
 /* `steps` unconditional steps of coarse rays. */
-static void disti_paper_coarse(const disti_tracer *tracer, int worker, const disti_bench *bench, disti_paper_ray *rays, size_t n, int steps)
+static void disti_paper_coarse(const disti_tracer *tracer, int worker, const disti_bench *bench, disti_paper_ray *rays,
+                               size_t n, int steps)
 {
     for (int step = 0; step < steps; step++) {
         size_t count = 0;
@@ -5892,7 +6033,8 @@ static void disti_paper_coarse(const disti_tracer *tracer, int worker, const dis
 }
 
 /* Child goes on where the parent is: same distance along the ray, the parent's samples. */
-static void disti_paper_inherit(const disti_tracer *tracer, const disti_paper_ray *parent, disti_ray *ray, float *samples)
+static void disti_paper_inherit(const disti_tracer *tracer, const disti_paper_ray *parent, disti_ray *ray,
+                                float *samples)
 {
     ray->s = (float)(parent->ray.base + (double)parent->ray.s - ray->base);
     ray->best = (float)(parent->ray.base + (double)parent->ray.best - ray->base);
@@ -5901,9 +6043,10 @@ static void disti_paper_inherit(const disti_tracer *tracer, const disti_paper_ra
     if (samples) memcpy(samples, parent->samples, (size_t)tracer->how.samples * 4 * sizeof(float));
 }
 
-/* Coarse rays of one level: blocks of `scale` pixels, centers at s g + (s - 1) / 2; alive where a pixel under them meets the
-   sphere. A coarse ray that itself misses it starts at the sphere's tangent length. */
-static size_t disti_paper_level(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench, int scale, disti_paper_ray *rays)
+/* Coarse rays of one level: blocks of `scale` pixels, centers at s g + (s - 1) / 2; alive where a pixel under them
+   meets the sphere. A coarse ray that itself misses it starts at the sphere's tangent length. */
+static size_t disti_paper_level(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench, int scale,
+                                disti_paper_ray *rays)
 {
     int across = (tile->width + scale - 1) / scale, down = (tile->height + scale - 1) / scale;
     for (int g = 0; g < across * down; g++) {
@@ -5915,7 +6058,8 @@ static size_t disti_paper_level(const disti_tracer *tracer, const disti_tile *ti
         disti_ray_init(tracer->field, tile->view->center, world, 0.0, &r->ray);
         disti_paper_clear(r->samples, tracer->how.samples);
         for (int y = y0; y < DISTI_MIN(y0 + scale, tile->height); y++)
-            for (int x = x0; x < DISTI_MIN(x0 + scale, tile->width); x++) alive |= bench->rays[y * tile->width + x].mode != DISTI_DONE;
+            for (int x = x0; x < DISTI_MIN(x0 + scale, tile->width); x++)
+                alive |= bench->rays[y * tile->width + x].mode != DISTI_DONE;
         if (alive && r->ray.mode == DISTI_DONE) r->ray.s = 0.0f; /* the closest approach */
         r->ray.mode = alive ? DISTI_MARCH : DISTI_DONE;
     }
@@ -5940,13 +6084,13 @@ static void disti_paper_finish(const disti_tracer *tracer, disti_ray *ray)
 }
 
 /* Traces one tile. samples (rays, how.samples, 4) may be NULL; it is written for every ray. */
-static void disti_paper_trace(const disti_tracer *tracer, int worker, const disti_tile *tile, const disti_bench *bench, float *samples,
-                              size_t samples_stride)
+static void disti_paper_trace(const disti_tracer *tracer, int worker, const disti_tile *tile, const disti_bench *bench,
+                              float *samples, size_t samples_stride)
 {
     size_t n = (size_t)(tile->width * tile->height), kept = (size_t)tracer->how.samples * 4;
     int row = tracer->how.paper_row, steps = tracer->how.max_steps;
     int pyramid = row == DIST_PAPER_COARSE_TO_FINE;
-    float alpha = pyramid || row == DIST_PAPER_AGGRESSIVE ? tracer->how.step_scale : 1.0f;
+    float alpha = disti_paper_alpha(&tracer->how);
     disti_paper_ray *quarter = (disti_paper_ray *)(void *)bench->rest, *half = quarter + 64;
     int across4 = (tile->width + 3) / 4, across2 = (tile->width + 1) / 2;
     if (pyramid) {
@@ -5954,7 +6098,8 @@ static void disti_paper_trace(const disti_tracer *tracer, int worker, const dist
         disti_paper_coarse(tracer, worker, bench, quarter, count, 3);
         count = disti_paper_level(tracer, tile, bench, 2, half);
         for (size_t g = 0; g < count; g++)
-            disti_paper_inherit(tracer, &quarter[(int)g / across2 / 2 * across4 + (int)g % across2 / 2], &half[g].ray, half[g].samples);
+            disti_paper_inherit(tracer, &quarter[(int)g / across2 / 2 * across4 + (int)g % across2 / 2], &half[g].ray,
+                                half[g].samples);
         disti_paper_coarse(tracer, worker, bench, half, count, 3);
         steps = DISTI_MAX(steps - 6, 1);
     }
@@ -5963,7 +6108,8 @@ static void disti_paper_trace(const disti_tracer *tracer, int worker, const dist
         float *mine = samples ? samples + y * samples_stride * kept + x * kept : NULL;
         disti_ray *ray = &bench->rays[i];
         if (mine) disti_paper_clear(mine, tracer->how.samples);
-        if (ray->mode != DISTI_DONE && pyramid) disti_paper_inherit(tracer, &half[y / 2 * (size_t)across2 + x / 2], ray, mine);
+        if (ray->mode != DISTI_DONE && pyramid)
+            disti_paper_inherit(tracer, &half[y / 2 * (size_t)across2 + x / 2], ray, mine);
     }
     for (int step = 0; step < steps; step++) {
         size_t count = 0;
@@ -5971,7 +6117,8 @@ static void disti_paper_trace(const disti_tracer *tracer, int worker, const dist
             disti_ray *ray = &bench->rays[i];
             float magnitude = ray->f < 0.0f ? -ray->f : ray->f;
             if (ray->mode == DISTI_DONE) continue;
-            if (row != DIST_PAPER_PARALLEL && step > 0 && !(ray->s < ray->leave && magnitude >= tracer->epsilon)) continue;
+            if (row != DIST_PAPER_PARALLEL && step > 0 && !(ray->s < ray->leave && magnitude >= tracer->epsilon))
+                continue;
             disti_ray_point(ray, ray->s, bench->points + 3 * count);
             bench->index[count++] = (int)i;
         }
@@ -5990,7 +6137,7 @@ static void disti_paper_trace(const disti_tracer *tracer, int worker, const dist
 }
 #endif
 
-/*@ 08 render -------------------------------------------------------------------------------------------------------------- */
+/*@ 08 render ------------------------------------------------------------------------------------------------------- */
 
 enum { DISTI_CHUNK = DISTI_SLOTS * 4 * DISTI_BLOCK }; /* points of the backward pass held at once */
 
@@ -6003,12 +6150,12 @@ typedef struct disti_entry {
     unsigned char capped;
 } disti_entry;
 
-/* distance and status: written by dist_render, read by the backward pass. samples: the paper's K (f and point), likewise.
-   The rest is the backward pass's work space. */
+/* distance and status: written by dist_render, read by the backward pass. samples: the paper's K (f and point),
+   likewise. The rest is the backward pass's work space. */
 struct dist_tape {
     dist_context *ctx;
     int width, height, trace, samples;
-    float *s;               /* (pixels): hit, or sample of smallest |f|, measured from the closest approach to the center */
+    float *s; /* (pixels): hit, or sample of smallest |f|, measured from the closest approach to the center */
     unsigned char *status;  /* (pixels): DIST_RAY_*, with DISTI_TAPE_* bits */
     float *sample;          /* (pixels, samples, 4), paper's tracer only */
     int rendered, has_silhouette;
@@ -6024,14 +6171,17 @@ enum { DISTI_TAPE_HIT = 16, DISTI_TAPE_SAMPLE = 32 }; /* counts as a hit; has a 
 
 static size_t disti_tape_bytes(const dist_tape *tape, int part)
 {
-    size_t pixels = (size_t)tape->width * (size_t)tape->height; /* at most 2^32: fits where size_t has 32 bits after the check */
+    size_t pixels = (size_t)tape->width *
+                    (size_t)tape->height; /* at most 2^32: fits where size_t has 32 bits after the check */
     size_t bytes = (size_t)-1;
     int good = (size_t)tape->height <= (size_t)-1 / (size_t)tape->width;
     switch (part) {
     case 0: good = good && disti_size_mul(pixels, sizeof(float), &bytes); break;
     case 1: bytes = pixels; break;
     case 2:
-        good = good && disti_size_mul(pixels, tape->trace == DIST_TRACE_PAPER ? (size_t)tape->samples * 4 * sizeof(float) : 0, &bytes);
+        good = good &&
+               disti_size_mul(pixels, tape->trace == DIST_TRACE_PAPER ? (size_t)tape->samples * 4 * sizeof(float) : 0,
+                              &bytes);
         break;
     case 3: bytes = DISTI_CHUNK * sizeof(disti_entry); break;
     case 4: bytes = DISTI_CHUNK * 7 * sizeof(float); break;
@@ -6070,7 +6220,8 @@ DIST_API dist_tape *dist_tape_create(dist_context *ctx, const dist_camera *camer
     tape->samples = raw.samples;
     tape->s = (float *)disti_alloc(ctx, disti_tape_bytes(tape, 0));
     tape->status = tape->s ? (unsigned char *)disti_alloc(ctx, disti_tape_bytes(tape, 1)) : NULL;
-    if (tape->status && raw.trace == DIST_TRACE_PAPER) tape->sample = (float *)disti_alloc(ctx, disti_tape_bytes(tape, 2));
+    if (tape->status && raw.trace == DIST_TRACE_PAPER)
+        tape->sample = (float *)disti_alloc(ctx, disti_tape_bytes(tape, 2));
     tape->entry = tape->status ? (disti_entry *)disti_alloc(ctx, disti_tape_bytes(tape, 3)) : NULL;
     tape->points = tape->entry ? (float *)disti_alloc(ctx, disti_tape_bytes(tape, 4)) : NULL;
     if (!tape->points || (raw.trace == DIST_TRACE_PAPER && !tape->sample)) {
@@ -6090,7 +6241,8 @@ static double disti_view_footprint(const disti_view *view, double cosine)
 }
 
 /* Ray of pixel (x, y), unit direction in camera space in `local`. */
-static void disti_pixel_ray(const disti_view *view, const dist_field *field, int x, int y, double local[3], disti_ray *ray)
+static void disti_pixel_ray(const disti_view *view, const dist_field *field, int x, int y, double local[3],
+                            disti_ray *ray)
 {
     double world[3];
     disti_view_direction(view, x, y, local);
@@ -6109,9 +6261,11 @@ typedef struct disti_render_job {
 /* Gradients of f at up to DISTI_GRADIENTS hit points at a time. */
 enum { DISTI_GRADIENTS = 1024 };
 
-/* normal    analytic: grad f / |grad f|;  difference: the same of G_i = (f(p + delta e_i) - f(p - delta e_i)) / (2 delta)
-   Writes G for n points; the analytic one in one pass, differences in six queries a point. G = 0 where it is not finite. */
-static void disti_normal_gradient(const disti_tracer *tracer, int worker, const disti_bench *bench, size_t n, const float *points, float *gradient)
+/* normal    analytic: G = grad f;  difference: G_i = (f(p + delta e_i) - f(p - delta e_i)) / (2 delta);  n = G / |G|
+   Writes G for n points; the analytic one in one pass, differences in six queries a point. G = 0 where it is not
+      finite. */
+static void disti_normal_gradient(const disti_tracer *tracer, int worker, const disti_bench *bench, size_t n,
+                                  const float *points, float *gradient)
 {
     const dist_field *field = tracer->field;
     if (tracer->how.normal_mode == DIST_NORMAL_ANALYTIC) {
@@ -6135,7 +6289,8 @@ static void disti_normal_gradient(const disti_tracer *tracer, int worker, const 
         if (!disti_finite_all(3, gradient + 3 * i)) gradient[3 * i] = gradient[3 * i + 1] = gradient[3 * i + 2] = 0.0f;
 }
 
-static void disti_render_normals(const disti_render_job *job, int worker, const disti_tile *tile, const disti_bench *bench)
+static void disti_render_normals(const disti_render_job *job, int worker, const disti_tile *tile,
+                                 const disti_bench *bench)
 {
     const disti_tracer *tracer = job->tracer;
     float *points = (float *)(void *)bench->rest, *gradient = points + 3 * DISTI_GRADIENTS;
@@ -6150,7 +6305,8 @@ static void disti_render_normals(const disti_render_job *job, int worker, const 
         if (count == 0) break;
         disti_normal_gradient(tracer, worker, bench, count, points, gradient);
         for (size_t k = 0; k < count; k++) {
-            double g[3] = {(double)gradient[3 * k], (double)gradient[3 * k + 1], (double)gradient[3 * k + 2]}, normal[3];
+            double g[3] = {(double)gradient[3 * k], (double)gradient[3 * k + 1], (double)gradient[3 * k + 2]},
+                   normal[3];
             if (!disti_normalize(g)) continue;
             if (tracer->how.normal_space == DIST_SPACE_WORLD) memcpy(normal, g, sizeof normal);
             else disti_rotate(tile->view->rotation, g, normal);
@@ -6161,7 +6317,8 @@ static void disti_render_normals(const disti_render_job *job, int worker, const 
     }
 }
 
-static void disti_render_colors(const disti_render_job *job, int worker, const disti_tile *tile, const disti_bench *bench)
+static void disti_render_colors(const disti_render_job *job, int worker, const disti_tile *tile,
+                                const disti_bench *bench)
 {
     const dist_field *field = job->tracer->field;
     float *points = (float *)(void *)bench->rest, *color = points + 3 * DISTI_GRADIENTS;
@@ -6184,20 +6341,22 @@ static void disti_render_colors(const disti_render_job *job, int worker, const d
     }
 }
 
-/* Value of the soft silhouette of a finished ray: signed f at a hit, |f| at a miss, less epsilon; off the sphere the line's
-   distance to it. The sign says hit or miss whatever rounding did. */
+/* Value of the soft silhouette of a finished ray: signed f at a hit, |f| at a miss, less epsilon; off the sphere the
+   line's distance to it. The sign says hit or miss whatever rounding did. */
 static float disti_ray_silhouette(const disti_tracer *tracer, const disti_ray *ray)
 {
     const dist_field *field = tracer->field;
     float tiny = 1e-3f * tracer->noise;
     if (ray->enter >= ray->leave) {
-        float d = disti_length(ray->origin[0] - field->center[0], ray->origin[1] - field->center[1], ray->origin[2] - field->center[2]);
+        float d = disti_length(ray->origin[0] - field->center[0], ray->origin[1] - field->center[1],
+                               ray->origin[2] - field->center[2]);
         return DISTI_MAX(d - field->radius, tiny);
     }
     float f = ray->fbest, magnitude = f < 0.0f ? -f : f;
     float epsilon = disti_ray_epsilon(tracer, ray, ray->best);
     if (ray->status == DIST_RAY_NOT_FINITE) return epsilon;
-    if (disti_ray_is_hit(tracer, ray)) return DISTI_MIN((tracer->how.trace == DIST_TRACE_PAPER ? f : magnitude) - epsilon, -tiny);
+    if (disti_ray_is_hit(tracer, ray))
+        return DISTI_MIN((tracer->how.trace == DIST_TRACE_PAPER ? f : magnitude) - epsilon, -tiny);
     if (tracer->how.trace == DIST_TRACE_PAPER) return DISTI_MAX(magnitude - epsilon, tiny);
     return DISTI_MAX(magnitude - epsilon, tiny);
 }
@@ -6246,7 +6405,8 @@ static void disti_render_task(void *arg, int index, int worker)
     tile.height = DISTI_MIN(job->tile, job->view->height - tile.y);
     int n = tile.width * tile.height;
     for (int i = 0; i < n; i++)
-        disti_pixel_ray(job->view, tracer->field, tile.x + i % tile.width, tile.y + i / tile.width, local, &bench.rays[i]);
+        disti_pixel_ray(job->view, tracer->field, tile.x + i % tile.width, tile.y + i / tile.width, local,
+                        &bench.rays[i]);
 #ifndef DIST_NO_PAPER
     if (tracer->how.trace == DIST_TRACE_PAPER) {
         size_t first = (size_t)tile.y * (size_t)job->view->width + (size_t)tile.x;
@@ -6264,8 +6424,8 @@ static void disti_render_task(void *arg, int index, int worker)
     if (job->out->color) disti_render_colors(job, worker, &tile, &bench);
 }
 
-DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, const dist_camera *camera, const dist_render_desc *desc,
-                                 const dist_images *out, dist_tape *tape)
+DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, const dist_camera *camera,
+                                 const dist_render_desc *desc, const dist_images *out, dist_tape *tape)
 {
     const char *name = "dist_render";
     disti_tracer tracer;
@@ -6279,19 +6439,22 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     if (!out) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: out is NULL", name, 0, 0);
     if (out->color && !field->color_fn)
         return disti_fail(ctx, DIST_UNSUPPORTED, "%s: out.color is wanted, but the field has no color", name, 0, 0);
-    if (tape && tape->ctx != ctx) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: tape belongs to another context", name, 0, 0);
+    if (tape && tape->ctx != ctx)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: tape belongs to another context", name, 0, 0);
     if (tape && (tape->width != camera->width || tape->height != camera->height))
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: tape is for another size than camera.width %d, height %d", name, camera->width,
-                          camera->height);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: tape is for another size than camera.width %d, height %d", name,
+                          camera->width, camera->height);
     if (tape && (tape->trace != tracer.how.trace || (tape->sample && tape->samples != tracer.how.samples)))
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: tape was created with another trace or another number of samples", name, 0, 0);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT,
+                          "%s: tape was created with another trace or another number of samples", name, 0, 0);
     disti_view_of(camera, &view);
     disti_stats_begin(ctx);
     job.tracer = &tracer;
     job.view = &view;
     job.out = out;
     job.tape = tape;
-    job.tile = tracer.how.trace == DIST_TRACE_PAPER || (double)view.width * view.height < 384.0 * 384.0 ? DISTI_TILE / 2 : DISTI_TILE;
+    job.tile = tracer.how.trace == DIST_TRACE_PAPER || (double)view.width * view.height < 384.0 * 384.0 ? DISTI_TILE / 2
+                                                                                                        : DISTI_TILE;
     job.across = (view.width + job.tile - 1) / job.tile;
     disti_run(ctx, job.across * ((view.height + job.tile - 1) / job.tile), disti_render_task, &job);
     disti_stats_end(ctx, &tracer, out->stats);
@@ -6309,18 +6472,18 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
 /* Backward of a picture, in terms of y = dL/dp, the pull on a point that moves with the field held still:
 
    depth = distance * z of the unit ray in camera space, so d_t = d_depth z + d_distance.
-   implicit   f(c + t v) = 0 gives dt = -(df + grad f . (dc + t dv)) / (grad f . v): the seed a = -d_t / (grad f . v) on df,
-              and y = a grad f. |grad f . v| counts as at least tau |grad f|, its sign kept; such rays are counted.
-   normal     the same with d_t weighted by |n . v|, so that grazing pixels do not dominate.
-   paper      t = sum of alpha f(p_k) over the K samples of smallest |f|, points held constant, nothing where |f| > 0.1: the
-              seed alpha d_t at each p_k. The residual e of eq. (4) is dropped, and K samples are summed, not averaged: the
-              paper's approximation, in the scale of its authors' code.                                         (paper, 3.4)
-   silhouette S = f(p_min) - epsilon: the seed d_S at the sample of smallest |f|                           (envelope theorem)
-              off the sphere S = |o| - radius with o the closest approach: y = d_S o / |o|.
+   implicit   f(c + t v) = 0 gives dt = -(df + grad f . (dc + t dv)) / (grad f . v): the seed
+              a = -d_t / (grad f . v) on df, and y = a grad f. |grad f . v| counts as at least tau |grad f|, its sign
+              kept; such rays are counted. normal     the same with d_t weighted by |n . v|, so that grazing pixels do
+              not dominate. paper      t = sum of alpha f(p_k) over the K samples of smallest |f|, points held
+              constant, nothing where |f| > 0.1: the seed alpha d_t at each p_k. The residual e of eq. (4) is dropped,
+              and K samples are summed, not averaged: the paper's approximation, in the scale of its authors' code.   
+                (paper, 3.4) silhouette S = f(p_min) - epsilon: the seed d_S at the sample of smallest |f|            
+                       (envelope theorem) off the sphere S = |o| - radius with o the closest approach: y = d_S o / |o|.
    normal n = G / |G|: u = (d_n - n (n . d_n)) / |G| pulls on G. Of the field: u . dG, by differences of df: analytic
-              (df(p + h u^) - df(p - h u^)) |u| / (2 h), difference mode sum_i u_i (df(p + h e_i) - df(p - h e_i)) / (2 h);
-              and, but in the paper's mode, of the hit's motion: y += H u, d_t += v . H u, from grad f at the same points.
-
+              (df(p + h u^) - df(p - h u^)) |u| / (2 h), difference mode sum_i u_i (df(p + h e_i) - df(p - h e_i)) /
+              (2 h); and, but in the paper's mode, of the hit's motion: y += H u, d_t += v . H u, from grad f at the
+              same points. 
    All of them end as seeds a on df and pulls y; for the camera, with q = R p and Y = R y: d_rotation -= q x Y,
    d_translation -= Y; and a normal in camera space turns with it: d_rotation += n x d_n.                      */
 typedef struct disti_render_backward_job {
@@ -6337,7 +6500,8 @@ typedef struct disti_render_backward_job {
 } disti_render_backward_job;
 
 /* Seeds once grad f is known: d_sdf = entry's own, and the implicit rule's. */
-static void disti_render_seed(void *user, size_t first, size_t count, const float *sdf, const float *gradient, float *d_sdf)
+static void disti_render_seed(void *user, size_t first, size_t count, const float *sdf, const float *gradient,
+                              float *d_sdf)
 {
     const dist_tape *tape = (const dist_tape *)user;
     int mode = tape->tracer.how.gradient;
@@ -6388,7 +6552,8 @@ static void disti_backward_flush(disti_render_backward_job *job)
     disti_field_backward_all(job->ctx, field, job->count, tape->points, tape->d_sdf, disti_render_seed, user.out,
                              tape->d_points, job->d_code);
     if (job->grads->weights)
-        field->weights_fn(field->user, job->ctx, job->count, tape->points, tape->d_sdf, NULL, NULL, NULL, NULL, job->grads->weights);
+        field->weights_fn(field->user, job->ctx, job->count, tape->points, tape->d_sdf, NULL, NULL, NULL, NULL,
+                          job->grads->weights);
     for (size_t i = 0; i < job->count; i++) {
         job->capped += tape->entry[i].capped;
         if (!job->pose) continue;
@@ -6403,7 +6568,8 @@ static void disti_backward_flush(disti_render_backward_job *job)
     job->count = 0;
 }
 
-static void disti_backward_add(disti_render_backward_job *job, const disti_ray *ray, const float *point, float d_distance, float d_sdf)
+static void disti_backward_add(disti_render_backward_job *job, const disti_ray *ray, const float *point,
+                               float d_distance, float d_sdf)
 {
     const dist_tape *tape = job->tape;
     disti_entry *entry = &tape->entry[job->count];
@@ -6415,7 +6581,8 @@ static void disti_backward_add(disti_render_backward_job *job, const disti_ray *
 }
 
 /* The normal's share of one pixel: its differences become entries; returns what its motion adds to d_distance. */
-static float disti_backward_normal(disti_render_backward_job *job, const disti_ray *ray, const float *p, const float *d_normal)
+static float disti_backward_normal(disti_render_backward_job *job, const disti_ray *ray, const float *p,
+                                   const float *d_normal)
 {
     const disti_tracer *tracer = &job->tape->tracer;
     const dist_field *field = &job->tape->field;
@@ -6462,7 +6629,8 @@ static float disti_backward_normal(disti_render_backward_job *job, const disti_r
 }
 
 /* One pixel with an upstream gradient. */
-static void disti_backward_pixel(disti_render_backward_job *job, size_t pixel, float d_distance, float d_silhouette, const float *d_normal)
+static void disti_backward_pixel(disti_render_backward_job *job, size_t pixel, float d_distance, float d_silhouette,
+                                 const float *d_normal)
 {
     const dist_tape *tape = job->tape;
     const dist_field *field = &tape->field;
@@ -6494,7 +6662,7 @@ static void disti_backward_pixel(disti_render_backward_job *job, size_t pixel, f
         for (int k = 0; k < (paper ? tape->samples : 1); k++) {
             float f = samples[4 * k], seed = k == 0 ? d_silhouette : 0.0f;
             int inside_clamp = (f < 0.0f ? -f : f) <= 0.1f * field->radius;
-            if (paper && inside_clamp) seed += tracer->how.step_scale * d_distance;
+            if (paper && inside_clamp) seed += disti_paper_alpha(&tracer->how) * d_distance;
             if (seed != 0.0f) disti_backward_add(job, &ray, samples + 4 * k + 1, 0.0f, seed);
         }
         if (!paper && d_distance != 0.0f) disti_backward_add(job, &ray, p, d_distance, 0.0f);
@@ -6525,7 +6693,8 @@ static void disti_backward_pixels(disti_render_backward_job *job)
             float d_distance = hit ? disti_upstream(d_out->distance, pixel) : 0.0f;
             float d_silhouette = disti_upstream(d_out->silhouette, pixel);
             float d_normal[3] = {0.0f, 0.0f, 0.0f};
-            for (size_t k = 0; hit && d_out->normal && k < 3; k++) d_normal[k] = disti_upstream(d_out->normal, 3 * pixel + k);
+            for (size_t k = 0; hit && d_out->normal && k < 3; k++)
+                d_normal[k] = disti_upstream(d_out->normal, 3 * pixel + k);
             int normal = d_normal[0] != 0.0f || d_normal[1] != 0.0f || d_normal[2] != 0.0f;
             if (d_depth != 0.0f) {
                 double local[3];
@@ -6542,21 +6711,25 @@ static void disti_backward_pixels(disti_render_backward_job *job)
     disti_backward_flush(job);
 }
 
-DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *tape, const dist_images *d_out, const dist_gradients *grads)
+DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *tape, const dist_images *d_out,
+                                          const dist_gradients *grads)
 {
     const char *name = "dist_render_backward";
     disti_render_backward_job job;
     dist_status status = disti_enter(ctx, name);
     if (status != DIST_OK) return status;
     if (!tape || !tape->rendered)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: tape is %s; it must have been filled by dist_render", tape ? "empty" : "NULL", 0, 0);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: tape is %s; it must have been filled by dist_render",
+                          tape ? "empty" : "NULL", 0, 0);
     if (tape->ctx != ctx) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: tape belongs to another context", name, 0, 0);
     if (!d_out) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: d_out is NULL", name, 0, 0);
     status = disti_gradients_check(ctx, &tape->field, grads, name);
     if (status != DIST_OK) return status;
     if (d_out->silhouette && !tape->has_silhouette && tape->trace != DIST_TRACE_PAPER)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: d_out.silhouette is given, but out.silhouette was NULL in dist_render", name, 0, 0);
-    if (d_out->color) return disti_fail(ctx, DIST_UNSUPPORTED, "%s: d_out.color has no adjoint yet, must be NULL", name, 0, 0);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT,
+                          "%s: d_out.silhouette is given, but out.silhouette was NULL in dist_render", name, 0, 0);
+    if (d_out->color)
+        return disti_fail(ctx, DIST_UNSUPPORTED, "%s: d_out.color has no adjoint yet, must be NULL", name, 0, 0);
     memset(&job, 0, sizeof job);
     size_t size = (size_t)tape->field.code_size;
     if (size + size / DISTI_SLOTS + 1 > ctx->partial_size)
@@ -6587,10 +6760,10 @@ DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *ta
 }
 #endif
 
-/*@ 09 loss ---------------------------------------------------------------------------------------------------------------- */
+/*@ 09 loss --------------------------------------------------------------------------------------------------------- */
 
-/* A pixel counts where the mask has a hit (no mask: everywhere). What is not finite never counts: one bad pixel must not
-   spoil the mean of the others. */
+/* A pixel counts where the mask has a hit (no mask: everywhere). What is not finite never counts: one bad pixel must
+   not spoil the mean of the others. */
 static int disti_loss_hit(const unsigned char *mask, size_t i)
 {
     return mask == NULL || mask[i] != 0;
@@ -6603,13 +6776,14 @@ static double disti_sign(double x)
 
 static int disti_loss_depth_counts(const float *depth, const float *target, const unsigned char *mask, size_t i)
 {
-    return disti_loss_hit(mask, i) && disti_finite(target[i]) && target[i] > 0.0f && target[i] < 1e5f && disti_finite(depth[i]);
+    return disti_loss_hit(mask, i) && disti_finite(target[i]) && target[i] > 0.0f && target[i] < 1e5f &&
+           disti_finite(depth[i]);
 }
 
 /* forward   L = weight / N sum_i |depth_i - target_i|
    backward  d_depth_i += weight / N sign(depth_i - target_i); 0 at the kink */
-DIST_API float dist_loss_depth(size_t n, const float *depth, const float *target, const unsigned char *mask, float weight,
-                               float *d_depth)
+DIST_API float dist_loss_depth(size_t n, const float *depth, const float *target, const unsigned char *mask,
+                               float weight, float *d_depth)
 {
     double sum = 0.0;
     size_t count = 0;
@@ -6638,8 +6812,8 @@ static double disti_loss_normal_scale(const float *normal, const float *target, 
 
 /* forward   L = -weight / N sum_i normal_i . target_i / |target_i|
    backward  d_normal_i += -weight / N target_i / |target_i| */
-DIST_API float dist_loss_normal(size_t n, const float *normal, const float *target, const unsigned char *mask, float weight,
-                                float *d_normal)
+DIST_API float dist_loss_normal(size_t n, const float *normal, const float *target, const unsigned char *mask,
+                                float weight, float *d_normal)
 {
     double sum = 0.0;
     size_t count = 0;
@@ -6691,8 +6865,8 @@ static int disti_loss_color_counts(const float *color, const float *target, cons
 
 /* forward   L = weight / (3 N) sum_i |color_i - target_i|_1
    backward  d_color_i += weight / (3 N) sign(color_i - target_i); 0 at the kink */
-DIST_API float dist_loss_color(size_t n, const float *color, const float *target, const unsigned char *mask, float weight,
-                               float *d_color)
+DIST_API float dist_loss_color(size_t n, const float *color, const float *target, const unsigned char *mask,
+                               float weight, float *d_color)
 {
     double sum = 0.0;
     size_t count = 0;
@@ -6726,7 +6900,7 @@ DIST_API float dist_loss_code(size_t n, const float *code, float weight, float *
     return (float)((double)weight * sum);
 }
 
-/*@ 10 optimizer ----------------------------------------------------------------------------------------------------------- */
+/*@ 10 optimizer ---------------------------------------------------------------------------------------------------- */
 
 #ifndef DIST_NO_BACKWARD
 /* forward   m <- beta1 m + (1 - beta1) g,   v <- beta2 v + (1 - beta2) g^2
@@ -6763,7 +6937,7 @@ DIST_API size_t dist_adam_step(dist_adam *adam, size_t n, float *x, const float 
 }
 #endif
 
-/*@ 11 mesh, metrics ------------------------------------------------------------------------------------------------------- */
+/*@ 11 mesh, metrics ------------------------------------------------------------------------------------------------ */
 
 /* splitmix64: the same numbers everywhere for one seed. */
 DISTI_UNUSED static uint64_t disti_random_bits(uint64_t *state)
@@ -6786,7 +6960,8 @@ static double disti_random_unit(uint64_t *state)
 static void *disti_grow(dist_context *ctx, void *array, size_t *capacity, size_t each)
 {
     size_t more, bytes;
-    if (!disti_size_add(*capacity, *capacity / 2 + 64, &more) || !disti_size_mul(more, each, &bytes)) bytes = (size_t)-1;
+    if (!disti_size_add(*capacity, *capacity / 2 + 64, &more) || !disti_size_mul(more, each, &bytes))
+        bytes = (size_t)-1;
     void *grown = disti_alloc(ctx, bytes);
     if (!grown) return NULL;
     if (array) memcpy(grown, array, *capacity * each);
@@ -6833,7 +7008,8 @@ static int disti_mesh_add_vertex(dist_mesh *mesh, const float p[3])
 static int disti_mesh_add_triangle(dist_mesh *mesh, unsigned a, unsigned b, unsigned c)
 {
     if (mesh->triangle_count == mesh->triangle_capacity) {
-        unsigned *grown = (unsigned *)disti_grow(mesh->owner, mesh->triangles, &mesh->triangle_capacity, 3 * sizeof(unsigned));
+        unsigned *grown = (unsigned *)disti_grow(mesh->owner, mesh->triangles, &mesh->triangle_capacity,
+                                                 3 * sizeof(unsigned));
         if (!grown) return 0;
         mesh->triangles = grown;
     }
@@ -6844,8 +7020,8 @@ static int disti_mesh_add_triangle(dist_mesh *mesh, unsigned a, unsigned b, unsi
     return 1;
 }
 
-DIST_API dist_mesh *dist_mesh_create(dist_context *ctx, size_t vertex_count, const float *vertices, size_t triangle_count,
-                                     const unsigned *triangles)
+DIST_API dist_mesh *dist_mesh_create(dist_context *ctx, size_t vertex_count, const float *vertices,
+                                     size_t triangle_count, const unsigned *triangles)
 {
     dist_mesh *mesh = NULL;
     size_t vertex_bytes, triangle_bytes;
@@ -6888,8 +7064,9 @@ fail:
     return NULL;
 }
 
-/* Marching cubes. Corner c of a cell stands at (c & 1, c >> 1 & 1, c >> 2 & 1); bit c of a case is set where the corner is
-   inside, f < level. An edge is axis * 8 + its lower corner. The triangles of a case are derived, not tabulated: */
+/* Marching cubes. Corner c of a cell stands at (c & 1, c >> 1 & 1, c >> 2 & 1); bit c of a case is set where the
+   corner is inside, f < level. An edge is axis * 8 + its lower corner. The triangles of a case are derived, not
+      tabulated: */
 typedef struct disti_case {
     unsigned char triangles;
     unsigned char edges[3 * 6]; /* six triangles are the most that occur */
@@ -6907,10 +7084,11 @@ static int disti_edges_share_face(int e, int f)
     return 0;
 }
 
-/* Where the surface goes from a crossed edge. Walking around a face counterclockwise as seen from outside the cell, each
-   edge that leaves the inside is joined to the edge where that run of inside corners was entered. The rule knows only the
-   face's own corners, so the two cells at a face draw the same segments, in opposite directions; on an ambiguous face it
-   keeps the two inside corners apart. Each crossed edge leaves on one of its faces and enters on the other: closed loops. */
+/* Where the surface goes from a crossed edge. Walking around a face counterclockwise as seen from outside the cell,
+   each edge that leaves the inside is joined to the edge where that run of inside corners was entered. The rule
+   knows only the face's own corners, so the two cells at a face draw the same segments, in opposite directions; on
+   an ambiguous face it keeps the two inside corners apart. Each crossed edge leaves on one of its faces and enters
+      on the other: closed loops. */
 static void disti_case_links(int code, unsigned char link[24])
 {
     memset(link, 0xff, 24);
@@ -6930,8 +7108,8 @@ static void disti_case_links(int code, unsigned char link[24])
     }
 }
 
-/* Fans each loop from a vertex from which no diagonal lies in a face of the cell: a neighbor could draw the same diagonal,
-   and four triangles would meet in it. There is always one. */
+/* Fans each loop from a vertex from which no diagonal lies in a face of the cell: a neighbor could draw the same
+   diagonal, and four triangles would meet in it. There is always one. */
 static void disti_cases(disti_case *cases)
 {
     for (int code = 0; code < 256; code++) {
@@ -6999,18 +7177,20 @@ static int disti_extract_eval(disti_extract *x, size_t n)
     float *sdf = x->batch + 3 * DISTI_MESH_BATCH;
     disti_field_eval_all(x->ctx, x->field, n, x->batch, sdf, NULL);
     if (disti_finite_all(n, sdf)) return 1;
-    disti_fail(x->ctx, DIST_NOT_FINITE, "dist_mesh_extract: the field is not finite everywhere in the cube", NULL, 0, 0);
+    disti_fail(x->ctx, DIST_NOT_FINITE, "dist_mesh_extract: the field is not finite everywhere in the cube", NULL, 0,
+               0);
     return 0;
 }
 
-/* Marks the blocks of slab `slab` that may hold the surface: |f(center) - level| <= lipschitz * half diagonal. A clamped f
-   says no more than that the distance is at least the clamp. */
+/* Marks the blocks of slab `slab` that may hold the surface: |f(center) - level| <= lipschitz * half diagonal. A
+   clamped f says no more than that the distance is at least the clamp. */
 static int disti_extract_mark(disti_extract *x, size_t slab)
 {
     const dist_field *field = x->field;
     const float *sdf = x->batch + 3 * DISTI_MESH_BATCH;
     double half = 0.5 * (double)x->block;
-    double slope = 1.1 * (field->lipschitz > 0.0f ? (double)field->lipschitz : 1.0); /* the figure is often an estimate */
+    double slope = 1.1 *
+                   (field->lipschitz > 0.0f ? (double)field->lipschitz : 1.0); /* the figure is often an estimate */
     double reach = slope * 1.7320508075688772 * half * 2.0 * (double)field->radius / (double)x->cells;
     size_t total = x->blocks * x->blocks;
     if (x->no_skip) {
@@ -7160,12 +7340,13 @@ static int disti_extract_surface(disti_extract *x)
     return 1;
 }
 
-/* Newton steps p <- p - (f - level) grad / |grad|^2, at most half a cell each, for up to a batch of vertices. A step that
-   brings f no nearer to the level is taken back and tried again at half its length. normals may be NULL. */
+/* Newton steps p <- p - (f - level) grad / |grad|^2, at most half a cell each, for up to a batch of vertices. A step
+   that brings f no nearer to the level is taken back and tried again at half its length. normals may be NULL. */
 static void disti_extract_polish(disti_extract *x, size_t n, int steps, float *vertices, float *normals)
 {
     float *points = x->batch, *sdf = points + 3 * DISTI_MESH_BATCH, *gradient = sdf + DISTI_MESH_BATCH;
-    float *best = gradient + 3 * DISTI_MESH_BATCH, *slope = best + DISTI_MESH_BATCH, *scale = slope + 3 * DISTI_MESH_BATCH;
+    float *best = gradient + 3 * DISTI_MESH_BATCH, *slope = best + DISTI_MESH_BATCH,
+          *scale = slope + 3 * DISTI_MESH_BATCH;
     double longest = (double)x->field->radius / (double)x->cells;
     memcpy(points, vertices, 3 * n * sizeof(float));
     for (int step = 0; step <= steps; step++) {
@@ -7241,7 +7422,8 @@ static dist_status disti_extract_check(dist_context *ctx, const dist_field *fiel
     dist_status status = disti_field_check(ctx, field, name);
     if (status != DIST_OK || !desc) return status;
     if (desc->resolution != 0 && (desc->resolution < 2 || desc->resolution > 2048))
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: resolution is %d, must be 2 to 2048, or 0", name, desc->resolution, 0);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: resolution is %d, must be 2 to 2048, or 0", name,
+                          desc->resolution, 0);
     if (desc->refine < 0 || desc->refine > 8)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: refine is %d, must be 0 to 8", name, desc->refine, 0);
     if (!disti_finite(desc->level))
@@ -7254,7 +7436,8 @@ DIST_API dist_mesh *dist_mesh_extract(dist_context *ctx, const dist_field *field
     disti_extract x;
     disti_case cases[256];
     int refine = desc ? desc->refine : 0, normals = desc ? desc->normals : 0, good = 0;
-    if (disti_enter(ctx, "dist_mesh_extract") != DIST_OK || disti_extract_check(ctx, field, desc) != DIST_OK) return NULL;
+    if (disti_enter(ctx, "dist_mesh_extract") != DIST_OK || disti_extract_check(ctx, field, desc) != DIST_OK)
+        return NULL;
     memset(&x, 0, sizeof x);
     x.ctx = ctx;
     x.field = field;
@@ -7285,7 +7468,8 @@ done:
 #ifndef DIST_NO_BACKWARD
 /* forward   f(v) = level, so that a change of f moves the vertex by dv = -n df / |grad f|, n = grad f / |grad f|
    backward  d_f_i = -(n . d_v_i) / |grad f| = -(grad f . d_v_i) / |grad f|^2; 0 where grad f is */
-static void disti_mesh_seed(void *user, size_t first, size_t count, const float *sdf, const float *gradient, float *d_sdf)
+static void disti_mesh_seed(void *user, size_t first, size_t count, const float *sdf, const float *gradient,
+                            float *d_sdf)
 {
     const float *d_vertices = *(const float *const *)user;
     (void)sdf;
@@ -7317,7 +7501,8 @@ DIST_API dist_status dist_mesh_backward(dist_context *ctx, const dist_field *fie
     for (size_t at = 0; status == DIST_OK && at < mesh->vertex_count; at += CHUNK) {
         const float *d_chunk = d_vertices + 3 * at;
         size_t n = DISTI_MIN(mesh->vertex_count - at, (size_t)CHUNK);
-        status = dist_field_backward(ctx, field, n, mesh->vertices + 3 * at, d_sdf, disti_mesh_seed, &d_chunk, NULL, grads);
+        status = dist_field_backward(ctx, field, n, mesh->vertices + 3 * at, d_sdf, disti_mesh_seed, &d_chunk, NULL,
+                                     grads);
     }
     return status;
 }
@@ -7366,7 +7551,8 @@ DIST_API dist_status dist_mesh_sample(dist_context *ctx, const dist_mesh *mesh, 
         if (t[0] < mesh->vertex_count && t[1] < mesh->vertex_count && t[2] < mesh->vertex_count) {
             until[i] = sum += disti_triangle_area(mesh, i);
         } else {
-            status = disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: triangle %d has a vertex out of range", name, (double)i, 0);
+            status = disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: triangle %d has a vertex out of range", name, (double)i,
+                                0);
             goto done;
         }
     }
@@ -7390,9 +7576,9 @@ done:
     return status;
 }
 
-/* A balanced tree over a copy of the points: node i has children 2i + 1 and 2i + 2, halves its range at the middle along
-   its longest side, and keeps the box around its points. Balance follows from ranks, not from coordinates, so equal
-   points, lines and outliers cost nothing extra; the tight boxes do the pruning. */
+/* A balanced tree over a copy of the points: node i has children 2i + 1 and 2i + 2, halves its range at the middle
+   along its longest side, and keeps the box around its points. Balance follows from ranks, not from coordinates, so
+   equal points, lines and outliers cost nothing extra; the tight boxes do the pruning. */
 typedef struct disti_tree {
     float *points; /* (n, 3), permuted */
     float *boxes;  /* (nodes, 6): low, high */
@@ -7408,13 +7594,14 @@ static void disti_swap_points(float *a, float *b)
     memcpy(b, t, sizeof t);
 }
 
-/* Puts the point of rank `rank` along `axis` in its place, smaller ones before and larger ones after it. The pivot is drawn
-   at random and both scans stop at equals: linear for every order of the points, also with many equal ones. */
+/* Puts the point of rank `rank` along `axis` in its place, smaller ones before and larger ones after it. The pivot
+   is drawn at random and both scans stop at equals: linear for every order of the points, also with many equal ones. */
 static void disti_tree_select(float *points, ptrdiff_t low, ptrdiff_t high, ptrdiff_t rank, size_t axis)
 {
     uint64_t random = (uint64_t)(high - low);
     while (low < high) { /* high is the last, not one beyond it */
-        float pivot = points[3 * (low + (ptrdiff_t)(disti_random_bits(&random) % (uint64_t)(high - low + 1))) + (ptrdiff_t)axis];
+        float pivot =
+            points[3 * (low + (ptrdiff_t)(disti_random_bits(&random) % (uint64_t)(high - low + 1))) + (ptrdiff_t)axis];
         ptrdiff_t i = low, j = high;
         while (i <= j) {
             while (points[3 * (size_t)i + axis] < pivot) i++;
@@ -7539,7 +7726,8 @@ typedef struct disti_chamfer_job {
     double *sums; /* one for each piece */
 } disti_chamfer_job;
 
-/* The points come in the order of their own tree: neighbors follow each other and the last answer is a good first guess. */
+/* The points come in the order of their own tree: neighbors follow each other and the last answer is a good first
+   guess. */
 static void disti_chamfer_task(void *arg, int index, int worker)
 {
     const disti_chamfer_job *job = (const disti_chamfer_job *)arg;
@@ -7578,8 +7766,8 @@ static dist_status disti_chamfer_check(dist_context *ctx, size_t n, const float 
     return DIST_OK;
 }
 
-DIST_API dist_status dist_chamfer(dist_context *ctx, size_t n, const float *a, size_t m, const float *b, double *chamfer,
-                                  double one_way[2])
+DIST_API dist_status dist_chamfer(dist_context *ctx, size_t n, const float *a, size_t m, const float *b,
+                                  double *chamfer, double one_way[2])
 {
     disti_tree trees[2];
     double parts[2];
@@ -7600,7 +7788,7 @@ DIST_API dist_status dist_chamfer(dist_context *ctx, size_t n, const float *a, s
 }
 #endif
 
-/*@ 12 files --------------------------------------------------------------------------------------------------------------- */
+/*@ 12 files -------------------------------------------------------------------------------------------------------- */
 
 /* Where a file in memory is written: counts always, stores while out is not NULL. */
 typedef struct disti_sink {
@@ -7683,7 +7871,9 @@ static int disti_text_number(disti_text *t, double *out)
     char copy[64];
     size_t n = 0;
     const char *c = t->at, *cursor = copy;
-    for (; c < t->end && n + 2 < sizeof copy && (*c == '+' || (*c >= '-' && *c <= '9' && *c != '/') || *c == 'e' || *c == 'E'); c++) {
+    for (; c < t->end && n + 2 < sizeof copy &&
+           (*c == '+' || (*c >= '-' && *c <= '9' && *c != '/') || *c == 'e' || *c == 'E');
+         c++) {
         if (*c == '.' && (n == 0 || copy[n - 1] < '0')) copy[n++] = '0';
         if (*c != '.' || (c + 1 < t->end && c[1] >= '0' && c[1] <= '9')) copy[n++] = *c;
     }
@@ -7693,12 +7883,14 @@ static int disti_text_number(disti_text *t, double *out)
     return 1;
 }
 
-static dist_status disti_pfm_check(dist_context *ctx, const char *name, int width, int height, int channels, size_t *floats)
+static dist_status disti_pfm_check(dist_context *ctx, const char *name, int width, int height, int channels,
+                                   size_t *floats)
 {
     dist_status status = disti_enter(ctx, name);
     if (status != DIST_OK) return status;
     if (width < 1 || height < 1)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: the picture is %d x %d, must be at least 1 x 1", name, width, height);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: the picture is %d x %d, must be at least 1 x 1", name, width,
+                          height);
     if (channels != 1 && channels != 3)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: channels is %d, must be 1 or 3", name, channels, 0);
     if (!disti_size_mul((size_t)width, (size_t)height, floats) || !disti_size_mul(*floats, (size_t)channels, floats) ||
@@ -7707,8 +7899,8 @@ static dist_status disti_pfm_check(dist_context *ctx, const char *name, int widt
     return DIST_OK;
 }
 
-DIST_API dist_status dist_pfm_write(dist_context *ctx, int width, int height, int channels, const float *pixels, void *buffer,
-                                    size_t capacity, size_t *size)
+DIST_API dist_status dist_pfm_write(dist_context *ctx, int width, int height, int channels, const float *pixels,
+                                    void *buffer, size_t capacity, size_t *size)
 {
     const char *name = "dist_pfm_write";
     size_t floats = 0;
@@ -7728,7 +7920,8 @@ DIST_API dist_status dist_pfm_write(dist_context *ctx, int width, int height, in
     if (!buffer) return DIST_OK;
     if (!pixels) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: pixels is NULL", name, 0, 0);
     if (capacity < *size)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: capacity is %d, must be %d", name, (double)capacity, (double)*size);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: capacity is %d, must be %d", name, (double)capacity,
+                          (double)*size);
     memcpy(buffer, header, sink.size);
     sink.out = (unsigned char *)buffer;
     size_t row = (size_t)width * (size_t)channels;
@@ -7752,25 +7945,30 @@ static dist_status disti_pfm_parse(dist_context *ctx, const char *label, const v
     t.at = (const char *)bytes;
     t.end = t.at + size;
     if (size < 3 || t.at[0] != 'P' || (t.at[1] != 'f' && t.at[1] != 'F') || !disti_is_space(t.at[2]))
-        return disti_fail(ctx, DIST_BAD_FILE, "dist_pfm_read (%s): not a PFM file, must begin with Pf or PF", label, 0, 0);
+        return disti_fail(ctx, DIST_BAD_FILE, "dist_pfm_read (%s): not a PFM file, must begin with Pf or PF", label, 0,
+                          0);
     pfm->channels = t.at[1] == 'F' ? 3 : 1;
     t.at += 2;
     for (int i = 0; i < 2; i++) {
         disti_skip_space(&t);
-        if (!disti_text_integer(&t, side + i) || side[i] < 1 || side[i] > 0x7fffffff || t.at == t.end || !disti_is_space(*t.at))
-            return disti_fail(ctx, DIST_BAD_FILE, "dist_pfm_read (%s): width or height is no number from 1 to 2147483647",
-                              label, 0, 0);
+        if (!disti_text_integer(&t, side + i) || side[i] < 1 || side[i] > 0x7fffffff || t.at == t.end ||
+            !disti_is_space(*t.at))
+            return disti_fail(ctx, DIST_BAD_FILE,
+                              "dist_pfm_read (%s): width or height is no number from 1 to 2147483647", label, 0, 0);
     }
     disti_skip_space(&t);
     if (!disti_text_number(&t, &scale) || !(scale < 0.0 || scale > 0.0) || t.at == t.end || !disti_is_space(*t.at))
-        return disti_fail(ctx, DIST_BAD_FILE, "dist_pfm_read (%s): the scale is not a number other than 0", label, 0, 0);
+        return disti_fail(ctx, DIST_BAD_FILE, "dist_pfm_read (%s): the scale is not a number other than 0", label, 0,
+                          0);
     pfm->width = (int)side[0];
     pfm->height = (int)side[1];
     pfm->big_endian = scale > 0.0;
     size_t left = (size_t)(t.end - t.at) - 1, need;
     if (!disti_size_mul((size_t)side[0], (size_t)side[1], &pfm->floats) ||
-        !disti_size_mul(pfm->floats, (size_t)pfm->channels, &pfm->floats) || !disti_size_mul(pfm->floats, 4, &need) || need > left)
-        return disti_fail(ctx, DIST_BAD_FILE, "dist_pfm_read (%s): truncated, %d bytes of pixels are there", label, (double)left, 0);
+        !disti_size_mul(pfm->floats, (size_t)pfm->channels, &pfm->floats) || !disti_size_mul(pfm->floats, 4, &need) ||
+        need > left)
+        return disti_fail(ctx, DIST_BAD_FILE, "dist_pfm_read (%s): truncated, %d bytes of pixels are there", label,
+                          (double)left, 0);
     /* one white space ends the header; of \r\n the second is the picture's first byte unless there is one to spare */
     int pair = t.at[0] == '\r' && left > need && t.at[1] == '\n';
     const unsigned char *first = (const unsigned char *)bytes;
@@ -7790,19 +7988,20 @@ static void disti_pfm_pixels(const disti_pfm *pfm, float *pixels)
         }
 }
 
-DIST_API dist_status dist_pfm_read(dist_context *ctx, const void *bytes, size_t size, int *width, int *height, int *channels,
-                                   float *pixels, size_t capacity)
+DIST_API dist_status dist_pfm_read(dist_context *ctx, const void *bytes, size_t size, int *width, int *height,
+                                   int *channels, float *pixels, size_t capacity)
 {
     disti_pfm pfm;
     dist_status status = disti_enter(ctx, "dist_pfm_read");
     if (status != DIST_OK) return status;
     if (!bytes || !width || !height || !channels)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_pfm_read: %s is NULL", bytes ? "width, height or channels" : "bytes", 0, 0);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_pfm_read: %s is NULL",
+                          bytes ? "width, height or channels" : "bytes", 0, 0);
     status = disti_pfm_parse(ctx, "in memory", bytes, size, &pfm);
     if (status != DIST_OK) return status;
     if (pixels && capacity < pfm.floats)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_pfm_read: capacity is %d floats, must be %d", NULL, (double)capacity,
-                          (double)pfm.floats);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_pfm_read: capacity is %d floats, must be %d", NULL,
+                          (double)capacity, (double)pfm.floats);
     *width = pfm.width;
     *height = pfm.height;
     *channels = pfm.channels;
@@ -7897,8 +8096,9 @@ static float disti_narrow(double x)
     return result;
 }
 
-/* A mesh file while it is read. Counts in it are never believed: every vertex and corner is read before there is memory for
-   it, so that memory stays within a small multiple of the file. All functions return 1, or 0 after disti_fail. */
+/* A mesh file while it is read. Counts in it are never believed: every vertex and corner is read before there is
+   memory for it, so that memory stays within a small multiple of the file. All functions return 1, or 0 after
+      disti_fail. */
 typedef struct disti_mesh_text {
     disti_text text;
     const char *begin;
@@ -7930,7 +8130,8 @@ static int disti_mesh_read_vertex(disti_mesh_text *r, const double v[3])
 static int disti_mesh_read_corner(disti_mesh_text *r, size_t k, double index)
 {
     if (!(index >= 0.0 && index < 4294967295.0) || index != (double)(unsigned)index)
-        return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): byte %d: a face has vertex %d, which is out of range", index);
+        return disti_mesh_fail(r, DIST_BAD_FILE,
+                               "dist_mesh_read (%s): byte %d: a face has vertex %d, which is out of range", index);
     unsigned corner = (unsigned)index;
     if (k == 0) r->first = corner;
     if (k >= 2 && !disti_mesh_add_triangle(r->mesh, r->first, r->last, corner)) return 0;
@@ -7949,7 +8150,8 @@ static int disti_read_obj(disti_mesh_text *r)
         for (int k = 0; !face && k < 3; k++) {
             disti_skip_blank(t);
             if (!disti_text_number(t, v + k))
-                return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): byte %d: a vertex must be three numbers", 0);
+                return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): byte %d: a vertex must be three numbers",
+                                       0);
         }
         if (!face && !disti_mesh_read_vertex(r, v)) return 0;
         for (size_t k = 0; face; k++) {
@@ -8042,7 +8244,8 @@ static int disti_ply_property_line(disti_mesh_text *r, disti_ply *ply)
 {
     disti_text *t = &r->text;
     if (ply->element_count == 0 || ply->property_count == DISTI_PLY_PROPERTIES)
-        return disti_mesh_fail(r, DIST_UNSUPPORTED, "dist_mesh_read (%s): byte %d: a PLY property without an element, or the 129th", 0);
+        return disti_mesh_fail(r, DIST_UNSUPPORTED,
+                               "dist_mesh_read (%s): byte %d: a PLY property without an element, or the 129th", 0);
     disti_ply_element *element = ply->elements + ply->element_count - 1;
     disti_ply_property *p = ply->properties + ply->property_count++;
     int list = disti_ply_word(t, "list");
@@ -8086,7 +8289,8 @@ static int disti_ply_header(disti_mesh_text *r, disti_ply *ply)
         } else if (disti_ply_word(t, "format")) {
             ply->ascii = disti_ply_word(t, "ascii");
             if (!ply->ascii && !disti_ply_word(t, "binary_little_endian"))
-                return disti_mesh_fail(r, DIST_UNSUPPORTED, "dist_mesh_read (%s): byte %d: PLY must be ascii or binary_little_endian", 0);
+                return disti_mesh_fail(r, DIST_UNSUPPORTED,
+                                       "dist_mesh_read (%s): byte %d: PLY must be ascii or binary_little_endian", 0);
         } else if (disti_ply_word(t, "element")) {
             if (!disti_ply_element_line(r, ply)) return 0;
         } else if (disti_ply_word(t, "property")) {
@@ -8107,7 +8311,8 @@ static int disti_ply_value(disti_mesh_text *r, const disti_ply *ply, int type, d
         if (disti_text_number(t, out) && (t->at == t->end || disti_is_space(*t->at))) return 1;
         return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): byte %d: truncated, or not a finite number", 0);
     }
-    if (t->end - t->at < sizes[type]) return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): truncated at byte %d", 0);
+    if (t->end - t->at < sizes[type])
+        return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): truncated at byte %d", 0);
     for (int i = 0; i < sizes[type]; i++) bits |= (uint64_t)(unsigned char)*t->at++ << 8 * i;
     uint32_t low = (uint32_t)(bits & 0xffffffffu);
     uint64_t sign = (uint64_t)1 << (8 * sizes[type] - 1);
@@ -8127,7 +8332,8 @@ static int disti_ply_skip(disti_mesh_text *r, const disti_ply *ply, int type)
     double ignored;
     if (!ply->ascii) return disti_ply_value(r, ply, type, &ignored);
     disti_skip_space(&r->text);
-    if (r->text.at == r->text.end) return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): truncated at byte %d", 0);
+    if (r->text.at == r->text.end)
+        return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): truncated at byte %d", 0);
     while (r->text.at < r->text.end && !disti_is_space(*r->text.at)) r->text.at++;
     return 1;
 }
@@ -8139,7 +8345,8 @@ static int disti_ply_item(disti_mesh_text *r, const disti_ply *ply, const disti_
     for (int i = element->first; i < element->last; i++) {
         const disti_ply_property *p = ply->properties + i;
         if (p->count_type < 0) {
-            if (p->role > 2 ? !disti_ply_skip(r, ply, p->type) : !disti_ply_value(r, ply, p->type, v + p->role)) return 0;
+            if (p->role > 2 ? !disti_ply_skip(r, ply, p->type) : !disti_ply_value(r, ply, p->type, v + p->role))
+                return 0;
             continue;
         }
         if (!disti_ply_value(r, ply, p->count_type, &count)) return 0;
@@ -8253,7 +8460,8 @@ static void disti_write_ply(disti_sink *sink, const dist_mesh *mesh)
     disti_sink_text(sink, "element face ");
     disti_sink_integer(sink, mesh->triangle_count);
     /* some programs read only int; uint where it is needed */
-    disti_sink_text(sink, mesh->vertex_count > 0x7fffffffu ? "\nproperty list uchar uint" : "\nproperty list uchar int");
+    disti_sink_text(sink,
+                    mesh->vertex_count > 0x7fffffffu ? "\nproperty list uchar uint" : "\nproperty list uchar int");
     disti_sink_text(sink, " vertex_indices\nend_header\n");
     for (size_t i = 0; i < mesh->vertex_count; i++) {
         for (size_t k = 0; k < 3; k++) disti_sink_float(sink, mesh->vertices[3 * i + k]);
@@ -8294,18 +8502,21 @@ static void disti_write_obj(disti_sink *sink, const dist_mesh *mesh)
     }
 }
 
-DIST_API dist_status dist_mesh_write(dist_context *ctx, const dist_mesh *mesh, int format, void *buffer, size_t capacity,
-                                     size_t *size)
+DIST_API dist_status dist_mesh_write(dist_context *ctx, const dist_mesh *mesh, int format, void *buffer,
+                                     size_t capacity, size_t *size)
 {
     const char *name = "dist_mesh_write";
     disti_sink sink;
     dist_status status = disti_enter(ctx, name);
     if (status != DIST_OK) return status;
-    if (!mesh || !size) return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_write: %s is NULL", mesh ? "size" : "mesh", 0, 0);
+    if (!mesh || !size)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_write: %s is NULL", mesh ? "size" : "mesh", 0, 0);
     if (format != DIST_MESH_PLY && format != DIST_MESH_OBJ)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: format is %d, must be DIST_MESH_PLY or DIST_MESH_OBJ", name, format, 0);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: format is %d, must be DIST_MESH_PLY or DIST_MESH_OBJ", name,
+                          format, 0);
     for (size_t i = 0; i < mesh->vertex_count; i++)
-        if (!disti_finite_all(3, mesh->vertices + 3 * i) || (mesh->normals && !disti_finite_all(3, mesh->normals + 3 * i)))
+        if (!disti_finite_all(3, mesh->vertices + 3 * i) ||
+            (mesh->normals && !disti_finite_all(3, mesh->normals + 3 * i)))
             return disti_fail(ctx, DIST_NOT_FINITE, "%s: vertex %d is not finite", name, (double)i, 0);
     memset(&sink, 0, sizeof sink);
     for (int pass = 0; pass < 2; pass++) { /* counts, then writes */
@@ -8314,7 +8525,8 @@ DIST_API dist_status dist_mesh_write(dist_context *ctx, const dist_mesh *mesh, i
         *size = sink.size;
         if (!buffer) return DIST_OK;
         if (capacity < *size)
-            return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: capacity is %d, must be %d", name, (double)capacity, (double)*size);
+            return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: capacity is %d, must be %d", name, (double)capacity,
+                              (double)*size);
         sink.out = (unsigned char *)buffer;
         sink.size = 0;
     }
@@ -8342,10 +8554,12 @@ DIST_API dist_status dist_mesh_save(dist_context *ctx, const dist_mesh *mesh, co
     size_t size = 0, n = path ? strlen(path) : 0;
     dist_status status = disti_enter(ctx, "dist_mesh_save");
     if (status != DIST_OK) return status;
-    if (!mesh || !path) return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_save: %s is NULL", mesh ? "path" : "mesh", 0, 0);
+    if (!mesh || !path)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_save: %s is NULL", mesh ? "path" : "mesh", 0, 0);
     int ply = n >= 4 && (memcmp(path + n - 4, ".ply", 4) == 0 || memcmp(path + n - 4, ".PLY", 4) == 0);
     int obj = n >= 4 && (memcmp(path + n - 4, ".obj", 4) == 0 || memcmp(path + n - 4, ".OBJ", 4) == 0);
-    if (!ply && !obj) return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_save: %s: must end in .ply or .obj", path, 0, 0);
+    if (!ply && !obj)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_save: %s: must end in .ply or .obj", path, 0, 0);
     int format = ply ? DIST_MESH_PLY : DIST_MESH_OBJ;
     status = dist_mesh_write(ctx, mesh, format, NULL, 0, &size);
     if (status != DIST_OK) return status;
@@ -8382,10 +8596,10 @@ DIST_API dist_status dist_mesh_save(dist_context *ctx, const dist_mesh *mesh, co
 
    Copyright (c) The dist.h authors
 
-   Permission is hereby granted, free of charge, to any person obtaining a copy of this software and associated documentation
-   files (the "Software"), to deal in the Software without restriction, including without limitation the rights to use, copy,
-   modify, merge, publish, distribute, sublicense, and/or sell copies of the Software, and to permit persons to whom the
-   Software is furnished to do so.
+   Permission is hereby granted, free of charge, to any person obtaining a copy of this software and associated
+   documentation files (the "Software"), to deal in the Software without restriction, including without limitation
+   the rights to use, copy, modify, merge, publish, distribute, sublicense, and/or sell copies of the Software, and
+   to permit persons to whom the Software is furnished to do so.
 
    THE SOFTWARE IS PROVIDED "AS IS", WITHOUT WARRANTY OF ANY KIND, EXPRESS OR IMPLIED, INCLUDING BUT NOT LIMITED TO THE
    WARRANTIES OF MERCHANTABILITY, FITNESS FOR A PARTICULAR PURPOSE AND NONINFRINGEMENT. IN NO EVENT SHALL THE AUTHORS OR

@@ -6474,16 +6474,19 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
    depth = distance * z of the unit ray in camera space, so d_t = d_depth z + d_distance.
    implicit   f(c + t v) = 0 gives dt = -(df + grad f . (dc + t dv)) / (grad f . v): the seed
               a = -d_t / (grad f . v) on df, and y = a grad f. |grad f . v| counts as at least tau |grad f|, its sign
-              kept; such rays are counted. normal     the same with d_t weighted by |n . v|, so that grazing pixels do
-              not dominate. paper      t = sum of alpha f(p_k) over the K samples of smallest |f|, points held
-              constant, nothing where |f| > 0.1: the seed alpha d_t at each p_k. The residual e of eq. (4) is dropped,
-              and K samples are summed, not averaged: the paper's approximation, in the scale of its authors' code.   
-                (paper, 3.4) silhouette S = f(p_min) - epsilon: the seed d_S at the sample of smallest |f|            
-                       (envelope theorem) off the sphere S = |o| - radius with o the closest approach: y = d_S o / |o|.
-   normal n = G / |G|: u = (d_n - n (n . d_n)) / |G| pulls on G. Of the field: u . dG, by differences of df: analytic
-              (df(p + h u^) - df(p - h u^)) |u| / (2 h), difference mode sum_i u_i (df(p + h e_i) - df(p - h e_i)) /
-              (2 h); and, but in the paper's mode, of the hit's motion: y += H u, d_t += v . H u, from grad f at the
-              same points. 
+              kept; such rays are counted.
+   normal     the same with d_t weighted by |n . v|, so that grazing pixels do not dominate.
+   paper      t = sum of alpha f(p_k) over the K samples of smallest |f|, points held constant, nothing where
+              |f| > 0.1: the seed alpha d_t at each p_k. The residual e of eq. (4) is dropped, and K samples are
+              summed, not averaged: the paper's approximation, in the scale of its authors' code.      (paper, 3.4)
+   silhouette S = f(p_min) - epsilon: the seed d_S at the sample of smallest |f|                    (envelope theorem)
+              off the sphere S = |o| - radius with o the closest approach: y = d_S o / |o|.
+   normal's   n = G / |G|: u = (d_n - n (n . d_n)) / |G| pulls on G. Of the field: u . dG, by differences of df:
+              analytic (df(p + h u^) - df(p - h u^)) |u| / (2 h), which is first-order exact where f is smooth and the
+              only derivative that a ReLU net has; difference mode sum_i u_i (df(p + h e_i) - df(p - h e_i)) / (2 h);
+              and, but in the paper's mode, of the hit's motion: y += H u, d_t += v . H u, from grad f at the same
+              points.
+
    All of them end as seeds a on df and pulls y; for the camera, with q = R p and Y = R y: d_rotation -= q x Y,
    d_translation -= Y; and a normal in camera space turns with it: d_rotation += n x d_n.                      */
 typedef struct disti_render_backward_job {

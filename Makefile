@@ -5,14 +5,14 @@
 #   make test           all tests, in a few minutes; the last line is the sum
 #   make matrix         the tests under every compiler, option and instruction set that this machine has
 #   make matrix-quick   the part of it that every change must pass
-#   make bench          the benchmarks, csv
+#   make bench          the benchmarks in short, csv; build/bench_NAME --help tells what else they do
 #   make clean
 
 CC = cc
 CXX = c++
 CFLAGS = -O2
 DEMO_COMMAND = build/fit_depth --demo --out out/demo
-BENCH_COMMAND = for b in $(BENCHES); do ./$$b || exit 1; done
+BENCH_COMMAND = for b in $(BENCHES); do echo "$$b"; ./$$b --quick || exit 1; done
 
 STRICT = -std=c99 -Wall -Wextra -Wpedantic -Wconversion -Wsign-conversion -Wshadow -Wcast-qual -Wundef \
          -Wdouble-promotion -Wmissing-prototypes -Werror
@@ -56,7 +56,7 @@ demo: build/fit_depth
 	@mkdir -p out
 	$(DEMO_COMMAND)
 
-bench: all
+bench: $(BENCHES)
 	@$(BENCH_COMMAND)
 
 test-programs: $(TESTS)

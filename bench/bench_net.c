@@ -1,0 +1,459 @@
+/* SPDX-License-Identifier: MIT-0
+   bench_net.c - how fast networks are evaluated and differentiated, against the multiply-add peak of the same
+   instruction set measured in the same seconds. CSV on stdout.
+
+   mode dense: every unit alive, so every multiply-add is done. dead: a real decoder at its own surface, where most
+   units are zero and left out; its rate counts what a dense net would do. backward: value and gradient at the point;
+   backward_code: that and the code's gradient. gflops counts the forward pass alone in all modes; of_forward is the
+   time in forward passes; executed is the share of the forward multiply-adds that was done. */
+#define DIST_IMPLEMENTATION
+#include "../dist.h"
+#include "../examples/common.h"
+#include "bench.h"
+#include <time.h>
+
+static const char usage[] =
+    "bench_net [options]\n"
+    "  --case NAME        8x512, 8x256, 8x128, 4x64 or 8x32: only this one\n"
+    "  --isa NAME         scalar, sse2, avx2, avx512 or neon: only this one\n"
+    "  --threads N        besides 1, where the build has OpenMP (default 2)\n"
+    "  --model FILE       a decoder at its own surface instead of the random nets; or the word embedded\n"
+    "  --code N           which of its codes (default 0)\n"
+    "  --repetitions N    of each measurement (default 9)\n"
+    "  --best             the fastest of them, not the median: for a machine that others use too\n"
+    "  --quick            the two extreme cases, one thread, short\n";
+
+typedef struct net_case {
+    const char *name;
+    int layers, width, skip, code_size;
+} net_case;
+
+static const net_case cases[] = {
+    {"8x512", 8, 512, 4, 256}, {"8x256", 8, 256, 4, 64}, {"8x128", 8, 128, 4, 64},
+    {"4x64", 4, 64, 0, 16},    {"8x32", 8, 32, 0, 16},
+};
+
+enum { CASES = sizeof cases / sizeof cases[0], MODES = 3, REPETITIONS_MAX = 1001 };
+
+typedef struct settings {
+    const char *only_case, *only_isa, *model;
+    int code, threads, repetitions, best, quick;
+} settings;
+
+/* ---- the peak: independent chains of x * m + a ------------------------------------------------------------------- */
+
+#if !defined(DIST_NO_SIMD) && defined(__x86_64__) && (defined(__GNUC__) || defined(__clang__))
+#define PEAK_X86
+#include <immintrin.h>
+#define TARGET(isa) __attribute__((target(isa)))
+#endif
+#if !defined(DIST_NO_SIMD) && defined(__aarch64__)
+#define PEAK_NEON
+#include <arm_neon.h>
+#endif
+
+/* Chains, so many that neither latency nor the number of registers is the limit. */
+#define CHAINS12(DO) DO(0) DO(1) DO(2) DO(3) DO(4) DO(5) DO(6) DO(7) DO(8) DO(9) DO(10) DO(11)
+#define CHAINS16(DO) CHAINS12(DO) DO(12) DO(13) DO(14) DO(15)
+#define CHAINS24(DO) CHAINS16(DO) DO(16) DO(17) DO(18) DO(19) DO(20) DO(21) DO(22) DO(23)
+
+#ifdef PEAK_X86
+#define PEAK(NAME, ATTRIBUTE, TYPE, SET, STORE, LANES, CHAINS, COUNT, DECLARE, STEP, SUM)   \
+    ATTRIBUTE static double NAME(long loops, float *sink)                      \
+    {                                                                                    \
+        float out[LANES];                                                                \
+        TYPE m = SET(0.999f), a = SET(0.001f), sum = a;                                  \
+        CHAINS(DECLARE)                                                                  \
+        for (long i = 0; i < loops; i++) {                                               \
+            CHAINS(STEP)                                                                 \
+        }                                                                                \
+        CHAINS(SUM)                                                                      \
+        STORE(out, sum);                                                                 \
+        *sink += out[0];                                                                 \
+        return 2.0 * (LANES) * (COUNT) * (double)loops;                                  \
+    }
+
+#define DECLARE_128(i) __m128 x##i = _mm_set1_ps(0.01f * (i));
+#define STEP_SS(i) x##i = _mm_add_ss(_mm_mul_ss(x##i, m), a);
+#define SUM_SS(i) sum = _mm_add_ss(sum, x##i);
+#define STEP_128(i) x##i = _mm_add_ps(_mm_mul_ps(x##i, m), a);
+#define SUM_128(i) sum = _mm_add_ps(sum, x##i);
+#define DECLARE_256(i) __m256 x##i = _mm256_set1_ps(0.01f * (i));
+#define STEP_256(i) x##i = _mm256_fmadd_ps(x##i, m, a);
+#define SUM_256(i) sum = _mm256_add_ps(sum, x##i);
+#define DECLARE_512(i) __m512 x##i = _mm512_set1_ps(0.01f * (i));
+#define STEP_512(i) x##i = _mm512_fmadd_ps(x##i, m, a);
+#define SUM_512(i) sum = _mm512_add_ps(sum, x##i);
+#define NO_TARGET
+PEAK(peak_scalar, NO_TARGET, __m128, _mm_set_ss, _mm_store_ss, 1, CHAINS12, 12, DECLARE_128, STEP_SS, SUM_SS)
+PEAK(peak_sse2, NO_TARGET, __m128, _mm_set1_ps, _mm_storeu_ps, 4, CHAINS12, 12, DECLARE_128, STEP_128, SUM_128)
+PEAK(peak_avx2, TARGET("avx2,fma"), __m256, _mm256_set1_ps, _mm256_storeu_ps, 8, CHAINS12, 12, DECLARE_256,
+     STEP_256, SUM_256)
+PEAK(peak_avx512, TARGET("avx512f"), __m512, _mm512_set1_ps, _mm512_storeu_ps, 16, CHAINS24, 24, DECLARE_512, STEP_512,
+     SUM_512)
+#undef TARGET
+#else
+/* Without intrinsics the chains are plain C; volatile constants keep the compiler from working ahead. */
+static double peak_scalar(long loops, float *sink)
+{
+    volatile float constants[2] = {0.999f, 0.001f};
+    float m = constants[0];
+    float a = constants[1];
+    float sum = 0.0f;
+#define DECLARE_1(i) float x##i = 0.01f * (i);
+#define STEP_1(i) x##i = x##i * m + a;
+#define SUM_1(i) sum += x##i;
+    CHAINS12(DECLARE_1)
+    for (long i = 0; i < loops; i++) {
+        CHAINS12(STEP_1)
+    }
+    CHAINS12(SUM_1)
+    *sink += sum;
+    return 2.0 * 12 * (double)loops;
+}
+#endif
+#ifdef PEAK_NEON
+static double peak_neon(long loops, float *sink)
+{
+    float32x4_t m = vdupq_n_f32(0.999f);
+    float32x4_t a = vdupq_n_f32(0.001f);
+    float32x4_t sum = a;
+#define DECLARE_NEON(i) float32x4_t x##i = vdupq_n_f32(0.01f * (i));
+#define STEP_NEON(i) x##i = vfmaq_f32(a, x##i, m);
+#define SUM_NEON(i) sum = vaddq_f32(sum, x##i);
+    CHAINS24(DECLARE_NEON)
+    for (long i = 0; i < loops; i++) {
+        CHAINS24(STEP_NEON)
+    }
+    CHAINS24(SUM_NEON)
+    *sink += vgetq_lane_f32(sum, 0);
+    return 2.0 * 4 * 24 * (double)loops;
+}
+#endif
+
+static double peak_loop(int isa, long loops, float *sink)
+{
+#ifdef PEAK_X86
+    if (isa == DIST_ISA_SSE2) { return peak_sse2(loops, sink); }
+    if (isa == DIST_ISA_AVX2) { return peak_avx2(loops, sink); }
+    if (isa == DIST_ISA_AVX512) { return peak_avx512(loops, sink); }
+#endif
+#ifdef PEAK_NEON
+    if (isa == DIST_ISA_NEON) { return peak_neon(loops, sink); }
+#endif
+    (void)isa;
+    return peak_scalar(loops, sink);
+}
+
+typedef struct peak_job {
+    int isa;
+    long loops;
+    double operations[64];
+    float sink[64];
+} peak_job;
+
+static void peak_task(void *arg, int index, int worker)
+{
+    peak_job *job = (peak_job *)arg;
+    (void)worker;
+    job->operations[index] = peak_loop(job->isa, job->loops, &job->sink[index]);
+}
+
+/* One thread is timed by its processor time, which other programs disturb least; several by the clock. */
+static double now_of(const dist_context *ctx)
+{
+    return dist_context_workers(ctx) == 1 ? (double)clock() / (double)CLOCKS_PER_SEC : seconds_now();
+}
+
+/* GFLOP/s of all workers together, once; *taken gets the seconds. */
+static double peak_once(dist_context *ctx, long loops, double *taken)
+{
+    static volatile float keep;
+    peak_job job;
+    int workers = dist_context_workers(ctx) < 64 ? dist_context_workers(ctx) : 64;
+    double sum = 0;
+    memset(&job, 0, sizeof job);
+    job.isa = dist_context_isa(ctx);
+    job.loops = loops;
+    double start = now_of(ctx);
+    disti_run(ctx, workers, peak_task, &job);
+    *taken = now_of(ctx) - start;
+    for (int i = 0; i < workers; i++) {
+        sum += job.operations[i];
+        keep = keep + job.sink[i];
+    }
+    return sum / (*taken + 1e-9) * 1e-9;
+}
+
+/* ---- what is measured -------------------------------------------------------------------------------------------- */
+
+typedef struct work {
+    dist_context *ctx;
+    dist_field field;
+    size_t batch;
+    const float *points;
+    float *sdf, *gradient, *d_sdf, *d_code;
+    double operations;
+} work;
+
+static void seed_ones(void *user, size_t first, size_t count, const float *sdf, const float *gradient, float *d_sdf)
+{
+    (void)user, (void)first, (void)sdf, (void)gradient;
+    for (size_t i = 0; i < count; i++) {
+        d_sdf[i] = 1.0f;
+    }
+}
+
+static void work_once(const work *w, int mode)
+{
+    dist_gradients grads;
+    memset(&grads, 0, sizeof grads);
+    grads.code = w->d_code;
+    if (mode == 0) { dist_field_eval(w->ctx, &w->field, w->batch, w->points, w->sdf, NULL); }
+    if (mode == 1) { dist_field_eval(w->ctx, &w->field, w->batch, w->points, w->sdf, w->gradient); }
+    if (mode == 2) {
+        dist_field_backward(w->ctx, &w->field, w->batch, w->points, w->d_sdf, seed_ones, NULL, w->gradient, &grads);
+    }
+}
+
+/* Seconds of one pass, over as many as fill `seconds`. */
+static double work_time(const work *w, int mode, int passes)
+{
+    double start = now_of(w->ctx);
+    for (int i = 0; i < passes; i++) {
+        work_once(w, mode);
+    }
+    return (now_of(w->ctx) - start) / passes;
+}
+
+/* Share of the multiply-adds that were not left out as dead units, of one forward pass over the batch. */
+static double executed_share(const work *w)
+{
+    double dense = 0;
+    double done = 0;
+    int workers = dist_context_workers(w->ctx);
+    for (int i = 0; i < workers; i++) {
+        memset(disti_counter_of(w->ctx, i), 0, sizeof(disti_counter));
+    }
+    work_once(w, 0);
+    for (int i = 0; i < workers; i++) {
+        dense += disti_counter_of(w->ctx, i)->dense;
+        done += disti_counter_of(w->ctx, i)->done;
+    }
+    return dense > 0 ? done / dense : 1;
+}
+
+/* Measures the three modes of one net in turn with the peak, several times, and prints a row each. */
+static void measure(const settings *s, const char *name, const work *w, const char *forward_name)
+{
+    static const char *const backward_names[MODES] = {NULL, "backward", "backward_code"};
+    static double peaks[REPETITIONS_MAX], times[MODES][REPETITIONS_MAX];
+    double length = s->quick ? 0.004 : 0.02;
+    int passes[MODES];
+    int modes = w->d_code ? MODES : MODES - 1;
+    size_t n = (size_t)s->repetitions;
+    for (int m = 0; m < modes; m++) { /* also warms caches and threads */
+        double once = work_time(w, m, 1);
+        once = work_time(w, m, once < length ? 2 : 1);
+        passes[m] = once < length ? (int)(length / (once + 1e-7)) + 1 : 1;
+    }
+    check(w->ctx);
+    double taken = 0;
+    peak_once(w->ctx, 100000, &taken);
+    long loops = (long)(100000 * length / (taken + 1e-5)) + 1;
+    double executed = executed_share(w);
+    for (size_t r = 0; r < n; r++) {
+        peaks[r] = -peak_once(w->ctx, loops, &taken);
+        for (int m = 0; m < modes; m++) {
+            times[m][r] = work_time(w, m, passes[m]);
+        }
+    }
+    check(w->ctx);
+    double share = s->best ? 0.0 : 0.5;
+    double peak = -quantile(n, peaks, share);
+    double forward = quantile(n, times[0], share);
+    for (int m = 0; m < modes; m++) {
+        double seconds = quantile(n, times[m], share);
+        double rate = (double)w->batch / seconds;
+        double gflops = 2e-9 * w->operations * rate;
+        printf("%s,%s,%d,%.0f,%.6f,%.0f,%.1f,%.1f,%.3f,%s,%.2f,%.3f\n", name, dist_isa_name(dist_context_isa(w->ctx)),
+               dist_context_workers(w->ctx), (double)w->batch, seconds, rate, gflops, peak, gflops / peak,
+               m == 0 ? forward_name : backward_names[m], seconds / forward, executed);
+    }
+    fflush(stdout);
+}
+
+/* Biases of 1 and weights so small that no unit can reach 0. */
+static void make_alive(dist_context *ctx, dist_net *net)
+{
+    size_t n = dist_net_weight_count(net);
+    float *weights = take_floats(n);
+    memcpy(weights, dist_net_weights(net), n * sizeof *weights);
+    for (int l = 0; l + 1 < net->layers; l++) {
+        const disti_linear *layer = &net->layer[l];
+        float largest = 1.0f / sqrtf((float)layer->in); /* of PyTorch's start */
+        for (size_t i = 0; i < (size_t)layer->in * (size_t)layer->out; i++) {
+            weights[layer->weight + i] *= 0.4f / ((float)layer->in * largest);
+        }
+        for (size_t i = 0; i < (size_t)layer->out; i++) {
+            weights[layer->bias + i] = 1.0f;
+        }
+    }
+    dist_net_set_weights(ctx, net, weights);
+    check(ctx);
+    free(weights);
+}
+
+static dist_net *make_net(dist_context *ctx, const net_case *c)
+{
+    dist_net_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.layers = c->layers;
+    desc.width = c->width;
+    desc.skip = c->skip;
+    desc.code_size = c->code_size;
+    desc.seed = 1;
+    dist_net *net = dist_net_create(ctx, &desc);
+    check(ctx);
+    make_alive(ctx, net);
+    return net;
+}
+
+static void random_points(size_t n, float *points)
+{
+    rng r = rng_begin(1);
+    for (size_t i = 0; i < 3 * n; i++) {
+        points[i] = 1.1f * rng_uniform(&r) - 0.55f;
+    }
+}
+
+/* Where the rays of a 512 x 512 picture meet the shape, in tiles of 8 x 8 pixels as the tracer goes through them; of
+   these, runs of a block's length, spread evenly. Returns the number of points. */
+static size_t surface_points(dist_context *ctx, const dist_field *field, size_t room, float *points)
+{
+    enum { SIZE = 512, TILE = 8, RUN = DISTI_BLOCK };
+    view v = view_default(SIZE, SIZE);
+    dist_camera camera = view_camera(&v, 0.0f);
+    size_t n = 0;
+    float *all = take_floats((size_t)3 * SIZE * SIZE);
+    dist_images out;
+    memset(&out, 0, sizeof out);
+    out.distance = take_floats((size_t)SIZE * SIZE);
+    out.mask = (unsigned char *)take((size_t)SIZE * SIZE, 1);
+    dist_render(ctx, field, &camera, NULL, &out, NULL);
+    check(ctx);
+    for (int k = 0; k < SIZE * SIZE; k++) {
+        int tile = k / (TILE * TILE);
+        int x = tile % (SIZE / TILE) * TILE + k % TILE;
+        int y = tile / (SIZE / TILE) * TILE + k / TILE % TILE;
+        float origin[3];
+        float direction[3];
+        if (!out.mask[y * SIZE + x]) { continue; }
+        dist_camera_ray(&camera, (float)x, (float)y, origin, direction);
+        for (int a = 0; a < 3; a++) {
+            all[3 * n + (size_t)a] = origin[a] + out.distance[y * SIZE + x] * direction[a];
+        }
+        n++;
+    }
+    size_t runs = room / RUN < n / RUN ? room / RUN : n / RUN;
+    if (runs == 0) { fail("the model shows only %.0f pixels; nothing to measure", (double)n); }
+    for (size_t i = 0; i < runs; i++) {
+        size_t first = i * (n - RUN) / runs;
+        memcpy(points + 3 * RUN * i, all + 3 * first, 3 * RUN * sizeof(float));
+    }
+    free(all);
+    free(out.distance);
+    free(out.mask);
+    return runs * RUN;
+}
+
+/* One net on one instruction set and number of threads. c: the random net to make; NULL: s->model. */
+static void measure_net(const settings *s, const net_case *c, int isa, int threads)
+{
+    dist_context_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.isa = isa;
+    desc.workers = threads;
+    work w;
+    memset(&w, 0, sizeof w);
+    w.ctx = dist_context_create(&desc);
+    check(w.ctx);
+    dist_net *net = c ? make_net(w.ctx, c) : load_model(w.ctx, s->model);
+    const float *code = c ? NULL : dist_net_code(net, s->code);
+    if (!c && dist_net_code_size(net) && !code) { fail("%s has no code %d", s->model, s->code); }
+    dist_shape *shape = dist_shape_create(w.ctx, net, code);
+    w.field = dist_shape_field(shape);
+    w.operations = (double)dist_net_operations(net, 1);
+    check(w.ctx);
+    int blocks = isa == DIST_ISA_SCALAR ? 4 : s->quick ? 16 : 64;
+    w.batch = (size_t)blocks * DISTI_BLOCK;
+    float *points = take_floats(3 * w.batch);
+    if (c) { random_points(w.batch, points); }
+    if (!c) { w.batch = surface_points(w.ctx, &w.field, w.batch, points); }
+    w.points = points;
+    w.sdf = take_floats(w.batch);
+    w.d_sdf = take_floats(w.batch);
+    w.gradient = take_floats(3 * w.batch);
+    if (dist_net_code_size(net)) { w.d_code = take_floats((size_t)dist_net_code_size(net)); }
+    measure(s, c ? c->name : s->model, &w, c ? "dense" : "dead");
+    free(points);
+    free(w.sdf);
+    free(w.d_sdf);
+    free(w.gradient);
+    free(w.d_code);
+    dist_shape_destroy(shape);
+    dist_net_destroy(net);
+    dist_context_destroy(w.ctx);
+}
+
+static settings read_options(int argc, char **argv)
+{
+    settings s = {NULL, NULL, NULL, 0, 2, 9, 0, 0};
+    options o = options_begin(argc, argv, usage);
+    while (option_next(&o)) {
+        if (option_is(&o, "--case")) {
+            s.only_case = option_text(&o);
+        } else if (option_is(&o, "--isa")) {
+            s.only_isa = option_text(&o);
+        } else if (option_is(&o, "--threads")) {
+            s.threads = option_int(&o, 1, 64);
+        } else if (option_is(&o, "--model")) {
+            s.model = option_text(&o);
+        } else if (option_is(&o, "--code")) {
+            s.code = option_int(&o, 0, 1 << 30);
+        } else if (option_is(&o, "--repetitions")) {
+            s.repetitions = option_int(&o, 1, REPETITIONS_MAX);
+        } else if (option_is(&o, "--best")) {
+            s.best = option_flag(&o);
+        } else if (option_is(&o, "--quick")) {
+            s.quick = option_flag(&o);
+        } else {
+            option_unknown(&o);
+        }
+    }
+    return s;
+}
+
+int main(int argc, char **argv)
+{
+    settings s = read_options(argc, argv);
+    int most = 1;
+#if defined(_OPENMP) && !defined(DIST_NO_OPENMP)
+    most = s.quick ? 1 : s.threads;
+#endif
+    puts("case,isa,threads,batch,seconds,queries_per_s,gflops,peak_gflops,share,mode,of_forward,executed");
+    for (int i = 0; i < (s.model ? 1 : (int)CASES); i++) {
+        const net_case *c = s.model ? NULL : &cases[i];
+        if (c && s.only_case && strcmp(s.only_case, c->name) != 0) { continue; }
+        if (c && s.quick && !s.only_case && i != 0 && i + 1 != CASES) { continue; }
+        for (int isa = DIST_ISA_SCALAR; isa <= DIST_ISA_NEON; isa++) {
+            if (!disti_cpu_has(isa)) { continue; }
+            if (s.quick && !s.only_isa && isa == DIST_ISA_SCALAR && i == 0) { continue; } /* seconds a pass */
+            if (s.only_isa && strcmp(s.only_isa, dist_isa_name(isa)) != 0) { continue; }
+            for (int threads = 1; threads <= most; threads += most > 1 ? most - 1 : 1) {
+                measure_net(&s, c, isa, threads);
+            }
+        }
+    }
+    return 0;
+}

@@ -371,6 +371,7 @@ typedef struct dist_render_desc {
     float background_color[3];
     float lipschitz;     /* 0: the field's */
     int no_cones;        /* 1: every ray marches from the bounding sphere by itself */
+    int no_prediction;   /* 1: no ray starts from what its neighbors found */
 } dist_render_desc;
 
 /* What will be used: every 0 replaced by its default. */
@@ -3274,8 +3275,8 @@ static void disti_encode_backward(const dist_net *net, const float *rows, const 
 
 /* forward   mu = mean_u x, v = mean_u (x - mu)^2, hat = (x - mu) / sqrt(v + eps), y = gamma hat + beta, for each
    lane */
-static void disti_norm(int units, float epsilon, const float *gamma, const float *beta, float *x, float *hat,
-                       float *inverse)
+static void disti_norm(int units, float epsilon, const float *gamma, const float *beta, float *DISTI_RESTRICT x,
+                       float *DISTI_RESTRICT hat, float *DISTI_RESTRICT inverse)
 {
     float mean[DISTI_BLOCK], variance[DISTI_BLOCK];
     size_t count = (size_t)units;
@@ -3302,7 +3303,8 @@ static void disti_norm(int units, float epsilon, const float *gamma, const float
 
 /* backward  g = gamma d_y,  d_x = (g - mean_u g - hat mean_u (g hat)) / sqrt(v + eps)     in place: d is d_y, then
    d_x */
-static void disti_norm_backward(int units, const float *gamma, const float *hat, const float *inverse, float *d)
+static void disti_norm_backward(int units, const float *gamma, const float *DISTI_RESTRICT hat,
+                                const float *DISTI_RESTRICT inverse, float *DISTI_RESTRICT d)
 {
     float mean[DISTI_BLOCK], along[DISTI_BLOCK];
     size_t count = (size_t)units;
@@ -5088,10 +5090,12 @@ typedef struct disti_ray {
     float enter, leave; /* of the bounding sphere, not before the camera; enter >= leave: it is not met */
     float footprint;    /* half a pixel's width at unit distance, cos^2 / (2 f)                     (paper,
     supplement) */
+    float cosine;       /* of the angle to the camera's axis: depth = distance * cosine */
+    float start, guard; /* where the cones left it, and at most f there (3e38 without cones) */
     float q;            /* where f is wanted next */
     float s, f;         /* front: nothing lies before it */
     float slope;        /* df/ds of the last two samples */
-    float a, fa, b, fb; /* bracket: fa > 0 >= fb, a < b */
+    float a, fa, b, fb; /* bracket: fa > 0 >= fb, a < b; while marching b, fb: a sample beyond a gap, fb = 0: none */
     float width;        /* bracket's width two queries ago */
     float best, fbest;  /* sample of smallest |f| */
     float error;
@@ -5103,7 +5107,18 @@ typedef struct disti_ray {
         moved; /* bracket: its end that moved last, 1 b, 2 a, 3 b twice; band: 1 if the ray came into it from outside */
 } disti_ray;
 
-enum { DISTI_DONE, DISTI_FIRST, DISTI_MARCH, DISTI_JUMP, DISTI_BACK, DISTI_BAND, DISTI_BRACKET, DISTI_CONES };
+enum {
+    DISTI_DONE,
+    DISTI_WAIT,    /* its turn has not come */
+    DISTI_FIRST,   /* the start of the march */
+    DISTI_MARCH,   /* a sphere step */
+    DISTI_SKIP,    /* past what other rays' samples prove empty */
+    DISTI_JUMP,    /* to where f should end */
+    DISTI_BACK,    /* back from a start inside */
+    DISTI_BAND,    /* 0 < f < epsilon */
+    DISTI_BRACKET, /* between two signs */
+    DISTI_PREDICT  /* where the neighbors say */
+};
 
 /* What one call traces with. */
 typedef struct disti_tracer {
@@ -5156,6 +5171,7 @@ static dist_status disti_how_check(dist_context *ctx, const dist_render_desc *ho
         return status;
     if ((status = disti_choice(ctx, function, "inside", how->inside, DIST_INSIDE_EXIT)) != DIST_OK) return status;
     if ((status = disti_choice(ctx, function, "no_cones", how->no_cones, 1)) != DIST_OK) return status;
+    if ((status = disti_choice(ctx, function, "no_prediction", how->no_prediction, 1)) != DIST_OK) return status;
     if (!disti_finite(how->step_scale) || how->step_scale < 0.0f || how->step_scale > 100.0f)
         return disti_fail(ctx, DIST_BAD_ARGUMENT,
                           "%s: how.step_scale is %d, must be above 0 (0: the default) and at most 100", function,
@@ -5226,6 +5242,7 @@ static void disti_ray_init(const dist_field *field, const double center[3], cons
         ray->direction[i] = (float)direction[i];
     }
     ray->base = along;
+    ray->cosine = 1.0f;
     ray->footprint = (float)footprint;
     ray->sign = 1.0f;
     ray->fbest = 3e38f;
@@ -5235,6 +5252,8 @@ static void disti_ray_init(const dist_field *field, const double center[3], cons
     ray->enter = (float)(-half > -along ? -half : -along); /* nothing behind the camera */
     ray->s = ray->best = ray->enter;
     ray->status = DIST_RAY_MISS;
+    ray->start = ray->enter;
+    ray->guard = 3e38f;
     ray->mode = half > 0.0 && ray->enter < ray->leave ? DISTI_FIRST : DISTI_DONE;
     if (ray->mode == DISTI_DONE) ray->leave = ray->enter;
     ray->q = ray->enter;
@@ -5276,7 +5295,10 @@ static int disti_ray_bracket(const disti_tracer *tracer, disti_ray *ray)
     float tolerance = 0.25f * disti_ray_epsilon(tracer, ray, ray->a);
     float spacing = 2.4e-7f * tracer->field->radius; /* s has no finer steps */
     float q = ray->a + width * (ray->fa / (ray->fa - ray->fb));
-    if (width <= DISTI_MAX(tolerance, spacing)) return disti_ray_end(ray, DIST_RAY_HIT, q, 0.0f, width);
+    if (width <= DISTI_MAX(tolerance, spacing)) {
+        ray->slope = (ray->fb - ray->fa) / DISTI_MAX(width, spacing);
+        return disti_ray_end(ray, DIST_RAY_HIT, q, 0.0f, width);
+    }
     int lopsided = ray->moved == 3 && -ray->fb < 0.01f * ray->fa &&
                    width > 64.0f * tolerance; /* f is flat beyond: regula falsi would crawl */
     if (lopsided || (ray->side >= 3 && width > 0.5f * ray->width)) {
@@ -5303,6 +5325,7 @@ static int disti_ray_bracketed(const disti_tracer *tracer, disti_ray *ray, float
     if (magnitude <= tolerance * slope * 0.5f && magnitude <= tolerance * (other > 0.0f ? other : -other)) {
         float s = ray->q + f / slope; /* one secant correction without a query */
         float error = magnitude / DISTI_MIN(slope, other > 0.0f ? other : -other);
+        ray->slope = -slope;
         return disti_ray_end(ray, DIST_RAY_HIT, s, 0.0f, error);
     }
     if (inside) {
@@ -5347,7 +5370,7 @@ static int disti_ray_step(const disti_tracer *tracer, disti_ray *ray)
     float slope = ray->slope / tracer->lipschitz;
     if (ray->s + radius >= ray->leave)
         return disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest * ray->sign, 0.0f);
-    float stretch = ray->steps < 2 ? tracer->how.step_scale : DISTI_MAX(1.0f, 2.0f / (1.0f - DISTI_MIN(slope, 0.75f)));
+    float stretch = ray->steps < 2 ? tracer->how.step_scale : DISTI_MAX(1.0f, 1.8f / (1.0f - DISTI_MIN(slope, 0.75f)));
     float step = radius * DISTI_MIN(stretch, 8.0f);
     int mode = DISTI_MARCH;
     if (ray->steps >= 2 && slope < -0.05f && ray->f < 0.05f * tracer->field->radius) {
@@ -5433,6 +5456,29 @@ static int disti_ray_inside(const disti_tracer *tracer, disti_ray *ray, float f)
     return disti_ray_step(tracer, ray);
 }
 
+/* A sample where the neighbors' hits and slopes predicted this ray's: Newton's steps, the first by their slope, the
+   others by its own. A step too long to trust, or f that does not shrink, sends the ray to march from where the cones
+   left it. */ static int disti_ray_predicted(const disti_tracer *tracer, disti_ray *ray, float f)
+{
+    float epsilon = disti_ray_epsilon(tracer, ray, ray->q);
+    float slope = ray->side == 0 ? ray->slope : (f - ray->fa) / (ray->q - ray->a);
+    float step = -f / slope, length = step < 0.0f ? -step : step;
+    float magnitude = f < 0.0f ? -f : f, before = ray->fa < 0.0f ? -ray->fa : ray->fa;
+    int good = slope < -0.12f * tracer->lipschitz && length < 0.03f * tracer->field->radius &&
+               (ray->side == 0 || magnitude < before) && ray->side < 4;
+    if (good && length <= (ray->side == 0 ? 4.0f : 12.0f) * epsilon) {
+        float s = ray->q + step;
+        ray->slope = slope;
+        return disti_ray_end(ray, DIST_RAY_HIT, s, f, length);
+    }
+    if (!good || ray->q + step <= ray->start || ray->q + step >= ray->leave)
+        return disti_ray_ask(ray, DISTI_FIRST, ray->start);
+    ray->a = ray->q;
+    ray->fa = f;
+    ray->side++;
+    return disti_ray_ask(ray, DISTI_PREDICT, ray->q + step);
+}
+
 /* One sample f at ray->q: what follows from it. 1: another query at ray->q; 0: done, ray->status says how. */
 static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float sample)
 {
@@ -5471,20 +5517,30 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
         ray->width *= 1.6f;
         return disti_ray_ask(ray, DISTI_BACK, DISTI_MAX(q - ray->width, ray->enter));
     case DISTI_BAND: return disti_ray_band(tracer, ray, f);
+    case DISTI_PREDICT: return disti_ray_predicted(tracer, ray, f);
+    case DISTI_SKIP:
     case DISTI_MARCH:
     case DISTI_JUMP: {
         if (f <= 0.0f) return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, q, f);
         float radius = ray->f / tracer->lipschitz, step = q - ray->s;
         float spacing = 4.8e-7f * tracer->field->radius;
-        if (step > radius + f / tracer->lipschitz && step > 1.0001f * radius + spacing &&
-            !disti_ray_trusts(tracer, ray, f, step)) {
+        if (ray->mode != DISTI_SKIP && step > radius + f / tracer->lipschitz && step > 1.0001f * radius + spacing &&
+            !disti_ray_trusts(tracer, ray, f, step)) { /* a gap between the two spheres: back, and keep the far one */
             float slope = (f - ray->f) / step;
             ray->slope = DISTI_MAX(slope, -tracer->lipschitz);
+            ray->b = q;
+            ray->fb = f;
             return disti_ray_ask(ray, DISTI_MARCH, DISTI_MIN(ray->s + DISTI_MAX(radius, spacing), ray->leave));
         }
         ray->slope = (f - ray->f) / step;
         ray->s = q;
         ray->f = f;
+        if (ray->fb > 0.0f && ray->b > q && ray->b - q <= (f + ray->fb) / tracer->lipschitz) { /* the gap is closed */
+            ray->slope = (ray->fb - f) / (ray->b - q);
+            ray->s = ray->b;
+            ray->f = ray->fb;
+        }
+        if (ray->b <= q) ray->fb = 0.0f;
         break;
     }
     }
@@ -5500,7 +5556,16 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
 }
 
 /* A worker's share of the tracer's memory. */
-enum { DISTI_TILE = 64, DISTI_TILE_RAYS = DISTI_TILE * DISTI_TILE };
+enum { DISTI_TILE = 64, DISTI_TILE_RAYS = (DISTI_TILE + 1) * (DISTI_TILE + 1) };
+
+/* Spheres that samples of the tile's rays prove empty, radius f / L, kept for each block of 16 x 16 pixels: a later
+   ray of the block skips what they cover. The oldest makes room for the newest. */
+enum { DISTI_BALL_BLOCK = 16, DISTI_BALLS = 48, DISTI_BALL_LISTS = 5 * 5 };
+
+typedef struct disti_balls {
+    int count[DISTI_BALL_LISTS];
+    float ball[DISTI_BALL_LISTS][DISTI_BALLS][4]; /* center, radius */
+} disti_balls;
 
 typedef struct disti_bench { /* the work bench of one task */
     dist_stats *stats;
@@ -5509,6 +5574,8 @@ typedef struct disti_bench { /* the work bench of one task */
     float *sdf;        /* DISTI_TILE_RAYS */
     int *index;        /* DISTI_TILE_RAYS */
     unsigned char *rest; /* what else a task wants: DISTI_REST_BYTES */
+    disti_balls *balls;  /* NULL: rays do not share */
+    int width, publish;  /* of the tile; whether samples become balls */
 } disti_bench;
 
 enum { DISTI_REST_BYTES = 128 * 1024 };
@@ -5523,6 +5590,8 @@ static void disti_bench_init(const dist_context *ctx, int worker, disti_bench *b
     bench->sdf = (float *)disti_take(base, &at, DISTI_TILE_RAYS, sizeof(float));
     bench->index = (int *)disti_take(base, &at, DISTI_TILE_RAYS, sizeof(int));
     bench->rest = (unsigned char *)disti_take(base, &at, DISTI_REST_BYTES, 1);
+    bench->balls = NULL;
+    bench->width = bench->publish = 0;
     DIST_ASSERT(at <= DISTI_TRACE_BYTES);
 }
 
@@ -5531,26 +5600,94 @@ static void disti_ray_point(const disti_ray *ray, float s, float p[3])
     for (int i = 0; i < 3; i++) p[i] = ray->origin[i] + s * ray->direction[i];
 }
 
-/* Marches all rays that are not done, in rounds: one packed batch of points a round. */
-static void disti_trace_rounds(const disti_tracer *tracer, int worker, const disti_bench *bench, size_t n)
+static int disti_ball_list(const disti_bench *bench, int index)
 {
-    size_t active = 0;
-    for (size_t i = 0; i < n; i++)
-        if (bench->rays[i].mode != DISTI_DONE) bench->index[active++] = (int)i;
+    int x = index % bench->width / DISTI_BALL_BLOCK, y = index / bench->width / DISTI_BALL_BLOCK;
+    return 5 * y + x;
+}
+
+static void disti_publish(const disti_tracer *tracer, const disti_bench *bench, int index, const float *p, float f)
+{
+    float radius = f / tracer->lipschitz;
+    if (!(radius > 4e-3f * tracer->field->radius)) return;
+    int list = disti_ball_list(bench, index);
+    float *ball = bench->balls->ball[list][bench->balls->count[list]++ % DISTI_BALLS];
+    memcpy(ball, p, 3 * sizeof(float));
+    ball[3] = radius;
+}
+
+/* How far along the ray the balls cover it without a gap, from s on. */
+static float disti_covered(const disti_bench *bench, int index, const disti_ray *ray, float s)
+{
+    int list = disti_ball_list(bench, index);
+    int count = DISTI_MIN(bench->balls->count[list], (int)DISTI_BALLS);
+    for (int pass = 0, moved = 1; pass < 3 && moved; pass++) {
+        moved = 0;
+        for (int i = 0; i < count; i++) {
+            const float *ball = bench->balls->ball[list][i];
+            float d[3] = {ball[0] - ray->origin[0], ball[1] - ray->origin[1], ball[2] - ray->origin[2]};
+            float along = d[0] * ray->direction[0] + d[1] * ray->direction[1] + d[2] * ray->direction[2];
+            float half = ball[3] * ball[3] - (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] - along * along);
+            float from = s - along;
+            if (!(half > from * from)) continue; /* s is not within the ball */
+            float end = along + sqrtf(half);
+            if (end <= s + 1e-6f) continue;
+            s = end;
+            moved = 1;
+        }
+    }
+    return s;
+}
+
+/* Moves a ray that is about to step past what is known to be empty. 0: it is through. */
+static int disti_skip(const disti_tracer *tracer, const disti_bench *bench, int index, disti_ray *ray)
+{
+    if (ray->mode != DISTI_FIRST && ray->mode != DISTI_MARCH && ray->mode != DISTI_SKIP) return 1;
+    int begins = ray->mode == DISTI_FIRST;
+    float s = disti_covered(bench, index, ray, begins ? ray->q : ray->s);
+    if (s >= ray->leave) return disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest * ray->sign, 0.0f);
+    if (s <= ray->q) return 1;
+    ray->q = s;
+    if (begins) ray->start = s;
+    else ray->mode = DISTI_SKIP;
+    (void)tracer;
+    return 1;
+}
+
+/* Marches the `active` rays listed in bench->index, in rounds: one packed batch of points a round. */
+static void disti_trace_rounds(const disti_tracer *tracer, int worker, const disti_bench *bench, size_t active)
+{
     while (active > 0) {
         size_t kept = 0;
-        for (size_t i = 0; i < active; i++)
-            disti_ray_point(&bench->rays[bench->index[i]], bench->rays[bench->index[i]].q, bench->points + 3 * i);
+        for (size_t i = 0; i < active; i++) {
+            disti_ray *ray = &bench->rays[bench->index[i]];
+            if (bench->balls && !disti_skip(tracer, bench, bench->index[i], ray)) continue;
+            disti_ray_point(ray, ray->q, bench->points + 3 * kept);
+            bench->index[kept++] = bench->index[i];
+        }
+        active = kept;
+        kept = 0;
+        if (active == 0) return;
         tracer->field->eval_fn(tracer->field->user, worker, active, bench->points, bench->sdf, NULL);
         bench->stats->queries += active;
         for (size_t i = 0; i < active; i++) {
             disti_ray *ray = &bench->rays[bench->index[i]];
-            if (ray->mode == DISTI_BRACKET || ray->mode == DISTI_BAND) bench->stats->refine_queries++;
+            if (ray->mode >= DISTI_BAND) bench->stats->refine_queries++;
             else bench->stats->march_queries++;
+            if (bench->publish) disti_publish(tracer, bench, bench->index[i], bench->points + 3 * i, bench->sdf[i]);
             if (disti_ray_advance(tracer, ray, bench->sdf[i])) bench->index[kept++] = bench->index[i];
         }
         active = kept;
     }
+}
+
+/* All rays that are not done. */
+static void disti_trace_all(const disti_tracer *tracer, int worker, const disti_bench *bench, size_t n)
+{
+    size_t active = 0;
+    for (size_t i = 0; i < n; i++)
+        if (bench->rays[i].mode != DISTI_DONE) bench->index[active++] = (int)i;
+    disti_trace_rounds(tracer, worker, bench, active);
 }
 
 static void disti_stats_begin(dist_context *ctx)
@@ -5644,7 +5781,7 @@ static void disti_free_task(void *arg, int index, int worker)
         disti_ray_init(job->tracer->field, o, d, 0.0, &bench.rays[i]);
         if (!good) disti_ray_end(&bench.rays[i], DIST_RAY_NOT_FINITE, 0.0f, 0.0f, 0.0f);
     }
-    disti_trace_rounds(job->tracer, worker, &bench, n);
+    disti_trace_all(job->tracer, worker, &bench, n);
     for (size_t i = 0; i < n; i++) {
         const disti_ray *ray = &bench.rays[i];
         dist_hit *hit = job->hits + first + i;
@@ -5691,18 +5828,28 @@ typedef struct disti_cone {
     int x, y;     /* first pixel, within the tile */
     int size;
     int blocked;
+    float f;      /* last sample */
 } disti_cone;
 
-/* The tile as the cones see it. */
+/* A tile of the picture. Where the picture goes on, one more column and row are traced (never written), so that every
+   pixel has neighbors on both sides to be predicted from. */
 typedef struct disti_tile {
     const disti_view *view;
-    int x, y, width, height; /* in the picture; width and height at most DISTI_TILE */
+    int x, y, width, height; /* traced: at most DISTI_TILE + 1 each */
+    int own_width, own_height; /* written */
 } disti_tile;
+
+/* One past the last pixel of a block that starts at `first`: the extra column goes with the last block. */
+static int disti_block_end(int first, int size, int own, int traced)
+{
+    return first + size >= own ? traced : first + size;
+}
 
 static void disti_cone_init(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench,
                             disti_cone *cone)
 {
-    int x1 = DISTI_MIN(cone->x + cone->size, tile->width) - 1, y1 = DISTI_MIN(cone->y + cone->size, tile->height) - 1;
+    int x1 = disti_block_end(cone->x, cone->size, tile->own_width, tile->width) - 1;
+    int y1 = disti_block_end(cone->y, cone->size, tile->own_height, tile->height) - 1;
     double axis[3], corner[3], world[3], widest = 0.0;
     disti_view_direction(tile->view, tile->x + 0.5 * (cone->x + x1), tile->y + 0.5 * (cone->y + y1), axis);
     for (int i = 0; i < 4; i++) {
@@ -5732,6 +5879,7 @@ static void disti_cone_init(const disti_tracer *tracer, const disti_tile *tile, 
 static int disti_cone_advance(const disti_tracer *tracer, disti_cone *cone, float f)
 {
     cone->blocked = 1;
+    cone->f = f;
     if (!disti_finite(f)) return 0;
     double radius = ((double)f - (double)(tracer->epsilon > 0.0f ? tracer->epsilon : 5e-5f * tracer->field->radius)) /
                     (double)tracer->lipschitz;
@@ -5744,19 +5892,26 @@ static int disti_cone_advance(const disti_tracer *tracer, disti_cone *cone, floa
     return cone->blocked;
 }
 
-/* What the cones leave: rays of a block that is through are misses; the others start at the block's stop. */
-static void disti_cone_finish(const disti_tile *tile, const disti_bench *bench, const disti_cone *cone)
+/* What the cones leave: rays of a block that is through are misses; the others start at the block's stop, where f is
+   at most the axis's sample plus the Lipschitz figure times how far they are from the axis. */
+static void disti_cone_finish(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench,
+                              const disti_cone *cone)
 {
-    for (int y = cone->y; y < DISTI_MIN(cone->y + cone->size, tile->height); y++) {
-        for (int x = cone->x; x < DISTI_MIN(cone->x + cone->size, tile->width); x++) {
+    for (int y = cone->y; y < disti_block_end(cone->y, cone->size, tile->own_height, tile->height); y++) {
+        for (int x = cone->x; x < disti_block_end(cone->x, cone->size, tile->own_width, tile->width); x++) {
             disti_ray *ray = &bench->rays[y * tile->width + x];
             if (ray->mode == DISTI_DONE) continue;
             if (!cone->blocked || cone->t >= ray->base + (double)ray->leave) {
                 ray->mode = DISTI_DONE;
                 ray->status = DIST_RAY_MISS;
-            } else {
-                ray->q = DISTI_MAX(ray->enter, (float)(cone->t - ray->base));
+                continue;
             }
+            float p[3], axis[3];
+            ray->start = ray->q = DISTI_MAX(ray->enter, (float)(cone->t - ray->base));
+            disti_ray_point(ray, ray->start, p);
+            disti_ray_point(&cone->axis, (float)(cone->t - cone->axis.base), axis);
+            float away = disti_length(p[0] - axis[0], p[1] - axis[1], p[2] - axis[2]);
+            if (disti_finite(cone->f)) ray->guard = cone->f + tracer->lipschitz * away + 1e-3f * tracer->field->radius;
         }
     }
 }
@@ -5792,15 +5947,16 @@ static void disti_cone_rounds(const disti_tracer *tracer, int worker, const dist
     }
 }
 
-/* Blocks of 32, 16, 8, 4 pixels. The two cone lists stand in bench->rest. */
-static void disti_cones(const disti_tracer *tracer, int worker, const disti_tile *tile, const disti_bench *bench)
+/* Blocks of 32, 16, 8 and so on to `leaf` pixels. The two cone lists stand in bench->rest. */
+static void disti_cones(const disti_tracer *tracer, int worker, const disti_tile *tile, const disti_bench *bench,
+                        int leaf)
 {
     disti_cone *cones = (disti_cone *)(void *)bench->rest;
     disti_cone *next = cones + DISTI_CONES_MOST;
     int count = 0;
     memset(cones, 0, sizeof(disti_cone) * 4);
-    for (int y = 0; y < tile->height; y += DISTI_CONE_FIRST) {
-        for (int x = 0; x < tile->width; x += DISTI_CONE_FIRST) {
+    for (int y = 0; y < tile->own_height; y += DISTI_CONE_FIRST) {
+        for (int x = 0; x < tile->own_width; x += DISTI_CONE_FIRST) {
             cones[count].x = x;
             cones[count].y = y;
             cones[count++].size = DISTI_CONE_FIRST;
@@ -5811,8 +5967,8 @@ static void disti_cones(const disti_tracer *tracer, int worker, const disti_tile
         for (int i = 0; i < count; i++) disti_cone_init(tracer, tile, bench, &cones[i]);
         disti_cone_rounds(tracer, worker, bench, cones, count);
         for (int i = 0; i < count; i++) {
-            if (!cones[i].blocked || size == DISTI_CONE_LEAF) {
-                disti_cone_finish(tile, bench, &cones[i]);
+            if (!cones[i].blocked || size == leaf) {
+                disti_cone_finish(tracer, tile, bench, &cones[i]);
                 continue;
             }
             for (int k = 0; k < 4; k++) {
@@ -5822,15 +5978,113 @@ static void disti_cones(const disti_tracer *tracer, int worker, const disti_tile
                 child->x = cones[i].x + (k & 1 ? child->size : 0);
                 child->y = cones[i].y + (k & 2 ? child->size : 0);
                 child->t = cones[i].t;
-                children += child->x < tile->width && child->y < tile->height;
+                children += child->x < tile->own_width && child->y < tile->own_height;
             }
         }
-        if (size == DISTI_CONE_LEAF || children == 0) return;
+        if (size == leaf || children == 0) return;
         disti_cone *swap = cones;
         cones = next;
         next = swap;
         count = children;
     }
+}
+
+/* Prediction between neighbors: every 8th pixel is marched, then the pixels half way between known ones, three times
+   over. 1 / z is linear over a plane, so the distance is interpolated in it, from four collinear hits (-1, 9, 9, -1)
+   / 16 where they are near each other, else from two; most pixels then need one query. Two checks keep what is in
+   front from being missed: no prediction across a miss or a jump in depth; and f where the cones stopped must not be
+   smaller than the predicted surface alone would make it, or something else is near. */
+enum { DISTI_LATTICE = 8 };
+
+/* Prediction along one axis of the picture: neighbors at -h and h, and -3 h and 3 h if they are in the tile.
+   Returns 0 if they do not allow one. */
+static int disti_predict_axis(const disti_tracer *tracer, const disti_ray *ray, int at, int end, int h, int stride,
+                              float *depth, float *slope)
+{
+    float z[4];
+    float near = 0.1f * tracer->field->radius;
+    if (at - h < 0 || at + h >= end) return 0;
+    for (int k = 1; k <= 2; k++) {
+        const disti_ray *other = ray + (2 * k - 3) * h * stride;
+        if (other->status != DIST_RAY_HIT || other->mode != DISTI_DONE) return 0;
+        z[k] = (float)(other->base + (double)other->best) * other->cosine;
+        *slope += 0.5f * other->slope;
+    }
+    float steeper = DISTI_MIN(ray[-h * stride].slope, ray[h * stride].slope);
+    float flatter = DISTI_MAX(ray[-h * stride].slope, ray[h * stride].slope);
+    if (flatter > 0.4f * steeper) return 0; /* f does not fall alike at both: the slope here is anyone's guess */
+    float gap = z[1] - z[2];
+    if (gap > near || gap < -near || !(z[1] > 0.0f) || !(z[2] > 0.0f)) return 0;
+    float inverse = 0.5f * (1.0f / z[1] + 1.0f / z[2]);
+    if (at - 3 * h >= 0 && at + 3 * h < end) {
+        const disti_ray *left = ray - 3 * h * stride, *right = ray + 3 * h * stride;
+        float a = (float)(left->base + (double)left->best) * left->cosine;
+        float b = (float)(right->base + (double)right->best) * right->cosine;
+        int known = left->status == DIST_RAY_HIT && right->status == DIST_RAY_HIT && left->mode == DISTI_DONE &&
+                    right->mode == DISTI_DONE;
+        float off_a = a - z[1], off_b = b - z[2];
+        if (known && off_a * off_a < near * near && off_b * off_b < near * near && a > 0.0f && b > 0.0f)
+            inverse = (9.0f / z[1] + 9.0f / z[2] - 1.0f / a - 1.0f / b) * 0.0625f;
+    }
+    *depth = 1.0f / inverse;
+    return 1;
+}
+
+/* Sets up pixel (x, y) for its first query, half way between pixels at distance h known along x, y or both. */
+static void disti_predict(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench, int x, int y,
+                          int h)
+{
+    disti_ray *ray = &bench->rays[y * tile->width + x];
+    float z[2] = {0.0f, 0.0f}, slopes[2] = {0.0f, 0.0f};
+    int odd_x = x / h & 1, odd_y = y / h & 1;
+    int good = 1;
+    if (odd_x) good = disti_predict_axis(tracer, ray, x, tile->width, h, 1, &z[0], &slopes[0]);
+    if (odd_y) good = disti_predict_axis(tracer, ray, y, tile->height, h, tile->width, &z[1], &slopes[1]) && good;
+    float scale = odd_x && odd_y ? 0.5f : 1.0f;
+    float depth = scale * (z[0] + z[1]), slope = scale * (slopes[0] + slopes[1]);
+    ray->mode = DISTI_FIRST;
+    ray->q = ray->start;
+    if (!good || !(slope < -0.12f * tracer->lipschitz)) return;
+    float s = (float)((double)(depth / ray->cosine) - ray->base);
+    if (!(s > ray->start && s < ray->leave)) return;
+    if (-slope * (s - ray->start) > ray->guard) return; /* something nearer makes f small at the cones' stop */
+    ray->mode = DISTI_PREDICT;
+    ray->side = 0;
+    ray->slope = slope;
+    ray->q = s;
+}
+
+static void disti_trace_lattice(const disti_tracer *tracer, int worker, const disti_tile *tile, disti_bench *bench)
+{
+    size_t active = 0;
+    bench->balls = (disti_balls *)(void *)bench->rest;
+    bench->width = tile->width;
+    bench->publish = 1;
+    memset(bench->balls->count, 0, sizeof bench->balls->count);
+    for (int i = 0; i < tile->width * tile->height; i++) {
+        disti_ray *ray = &bench->rays[i];
+        if (ray->mode == DISTI_DONE) continue;
+        if (i % tile->width % DISTI_LATTICE == 0 && i / tile->width % DISTI_LATTICE == 0) bench->index[active++] = i;
+        else ray->mode = DISTI_WAIT;
+    }
+    disti_trace_rounds(tracer, worker, bench, active);
+    for (int h = DISTI_LATTICE / 2; h > 0; h /= 2) {
+        bench->publish = h > 1;
+        for (int pass = 1; pass <= 2; pass++) { /* between two known pixels, then amid four */
+            active = 0;
+            for (int y = 0; y < tile->height; y += h) {
+                for (int x = 0; x < tile->width; x += h) {
+                    int index = y * tile->width + x;
+                    if ((x / h & 1) + (y / h & 1) != pass || bench->rays[index].mode != DISTI_WAIT) continue;
+                    disti_predict(tracer, tile, bench, x, y, h);
+                    bench->index[active++] = index;
+                }
+            }
+            disti_trace_rounds(tracer, worker, bench, active);
+        }
+    }
+    bench->balls = NULL;
+    bench->publish = 0;
 }
 
 /* Soft silhouette of the rays that miss: min |f| along each. Cones and stretched steps leave no sample near the
@@ -6248,6 +6502,7 @@ static void disti_pixel_ray(const disti_view *view, const dist_field *field, int
     disti_view_direction(view, x, y, local);
     disti_rotate_back(view->rotation, local, world);
     disti_ray_init(field, view->center, world, disti_view_footprint(view, local[2]), ray);
+    ray->cosine = (float)local[2];
 }
 
 typedef struct disti_render_job {
@@ -6256,6 +6511,7 @@ typedef struct disti_render_job {
     const dist_images *out;
     dist_tape *tape;
     int tile, across;
+    int predict; /* pixels start from what their neighbors found */
 } disti_render_job;
 
 /* Gradients of f at up to DISTI_GRADIENTS hit points at a time. */
@@ -6390,6 +6646,16 @@ static void disti_render_planes(const disti_render_job *job, const disti_tile *t
     }
 }
 
+/* Drops the extra column and row: what follows is about the tile's own pixels. */
+static void disti_tile_trim(disti_tile *tile, const disti_bench *bench)
+{
+    for (int y = 0; y < tile->own_height && tile->width != tile->own_width; y++)
+        memmove(bench->rays + y * tile->own_width, bench->rays + y * tile->width,
+                (size_t)tile->own_width * sizeof(disti_ray));
+    tile->width = tile->own_width;
+    tile->height = tile->own_height;
+}
+
 static void disti_render_task(void *arg, int index, int worker)
 {
     const disti_render_job *job = (const disti_render_job *)arg;
@@ -6401,8 +6667,11 @@ static void disti_render_task(void *arg, int index, int worker)
     tile.view = job->view;
     tile.x = index % job->across * job->tile;
     tile.y = index / job->across * job->tile;
-    tile.width = DISTI_MIN(job->tile, job->view->width - tile.x);
-    tile.height = DISTI_MIN(job->tile, job->view->height - tile.y);
+    tile.own_width = tile.width = DISTI_MIN(job->tile, job->view->width - tile.x);
+    tile.own_height = tile.height = DISTI_MIN(job->tile, job->view->height - tile.y);
+    int predict = job->predict;
+    if (predict && tile.x + tile.width < job->view->width) tile.width++;
+    if (predict && tile.y + tile.height < job->view->height) tile.height++;
     int n = tile.width * tile.height;
     for (int i = 0; i < n; i++)
         disti_pixel_ray(job->view, tracer->field, tile.x + i % tile.width, tile.y + i / tile.width, local,
@@ -6415,13 +6684,25 @@ static void disti_render_task(void *arg, int index, int worker)
     } else
 #endif
     {
-        if (!tracer->how.no_cones) disti_cones(tracer, worker, &tile, &bench);
-        disti_trace_rounds(tracer, worker, &bench, (size_t)n);
+        if (!tracer->how.no_cones)
+            disti_cones(tracer, worker, &tile, &bench, predict ? (int)DISTI_LATTICE : (int)DISTI_CONE_LEAF);
+        if (predict) disti_trace_lattice(tracer, worker, &tile, &bench);
+        else disti_trace_all(tracer, worker, &bench, (size_t)n);
+        disti_tile_trim(&tile, &bench);
         if (job->out->silhouette) disti_silhouette(tracer, worker, &tile, &bench);
     }
     disti_render_planes(job, &tile, &bench);
     if (job->out->normal) disti_render_normals(job, worker, &tile, &bench);
     if (job->out->color) disti_render_colors(job, worker, &tile, &bench);
+}
+
+/* Neighbors say something about each other where pixels are near each other: a hundredth of the radius. */
+static int disti_render_predicts(const disti_tracer *tracer, const disti_view *view)
+{
+    double away[3], f = DISTI_MIN(fabs(view->fx), fabs(view->fy));
+    if (tracer->how.trace != DIST_TRACE_GUARDED || tracer->how.no_cones || tracer->how.no_prediction) return 0;
+    for (int i = 0; i < 3; i++) away[i] = view->center[i] - (double)tracer->field->center[i];
+    return sqrt(disti_dot(away, away)) < 0.01 * (double)tracer->field->radius * f;
 }
 
 DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, const dist_camera *camera,
@@ -6456,6 +6737,7 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     job.tile = tracer.how.trace == DIST_TRACE_PAPER || (double)view.width * view.height < 384.0 * 384.0 ? DISTI_TILE / 2
                                                                                                         : DISTI_TILE;
     job.across = (view.width + job.tile - 1) / job.tile;
+    job.predict = disti_render_predicts(&tracer, &view);
     disti_run(ctx, job.across * ((view.height + job.tile - 1) / job.tile), disti_render_task, &job);
     disti_stats_end(ctx, &tracer, out->stats);
     if (!tape) return DIST_OK;

@@ -1,0 +1,909 @@
+/* SPDX-License-Identifier: MIT-0
+   Pictures: what each plane means, what it costs, and that size, distance, scale, workers and order of tasks change nothing.
+   Numbers in comments are rows of the table of hard cases. */
+#include "shapes.h"
+
+enum { SIDE = 96, PIXELS = 8192 * 2 };
+
+/* Every plane, and what they were filled with before. */
+typedef struct planes {
+    float depth[PIXELS], distance[PIXELS], normal[3 * PIXELS], silhouette[PIXELS], color[3 * PIXELS], error[PIXELS];
+    unsigned char mask[PIXELS], status[PIXELS];
+    dist_stats stats;
+} planes;
+
+static planes a, b;
+
+static dist_images all_planes(planes *p)
+{
+    dist_images out;
+    memset(p, 0x5a, sizeof *p);
+    memset(&out, 0, sizeof out);
+    out.depth = p->depth;
+    out.distance = p->distance;
+    out.normal = p->normal;
+    out.silhouette = p->silhouette;
+    out.mask = p->mask;
+    out.status = p->status;
+    out.error = p->error;
+    out.stats = &p->stats;
+    return out;
+}
+
+static dist_render_desc plain_how(void)
+{
+    dist_render_desc how;
+    memset(&how, 0, sizeof how);
+    return how;
+}
+
+static test_shape some_shape(int k)
+{
+    if (k == 0) return shape_make(SHAPE_SPHERE, 0.6, 0, 0, 0);
+    if (k == 1) return shape_make(SHAPE_TORUS, 0.6, 0.2, 0, 0);
+    return shape_make(SHAPE_BOX, 0.4, 0.5, 0.3, 0);
+}
+
+static void normal_of(const test_shape *shape, const double p[3], double n[3])
+{
+    double length = 0;
+    for (int k = 0; k < 3; k++) {
+        double u[3] = {p[0], p[1], p[2]}, v[3] = {p[0], p[1], p[2]};
+        u[k] += 1e-6;
+        v[k] -= 1e-6;
+        n[k] = (shape_exact(shape, u) - shape_exact(shape, v)) / 2e-6;
+        length += n[k] * n[k];
+    }
+    for (int k = 0; k < 3; k++) n[k] /= sqrt(length);
+}
+
+/* ---- what the planes mean ------------------------------------------------------------------------------------------- */
+
+TEST(planes_mean_what_the_interface_says)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(SIDE, SIDE);
+    dist_render_desc how = plain_how();
+    how.background = -7.5f;
+    for (int k = 0; k < 3; k++) {
+        test_shape shape = some_shape(k);
+        dist_field field = shape_field(&shape, 1, 1);
+        dist_images out = all_planes(&a);
+        int hits = 0;
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+        for (int i = 0; i < SIDE * SIDE; i++) {
+            double o[3], d[3], z = shape_pixel(&camera, i % SIDE, i / SIDE, o, d);
+            const float *n = a.normal + 3 * i;
+            double length = shape_length((double)n[0], (double)n[1], (double)n[2]);
+            CHECK_EQUAL(a.status[i] == DIST_RAY_HIT, a.mask[i]);
+            CHECK((a.silhouette[i] < 0) == a.mask[i]);
+            if (a.mask[i]) {
+                hits++;
+                CHECK_NEAR(z * (double)a.distance[i], a.depth[i], 1e-6);
+                CHECK(fabs(shape_along(&shape, o, d, (double)a.distance[i])) < 6e-5);
+                CHECK_NEAR(1, length, 1e-5);
+                CHECK(a.error[i] >= 0 && test_finite((double)a.error[i]));
+            } else {
+                CHECK_NEAR(-7.5, a.depth[i], 0);
+                CHECK_NEAR(-7.5, a.distance[i], 0);
+                CHECK_NEAR(0, length, 0);
+                CHECK_NEAR(0, a.error[i], 0);
+                CHECK(a.silhouette[i] > 0);
+            }
+        }
+        CHECK(hits > 500);
+        CHECK_EQUAL(hits, a.stats.hits);
+    }
+    dist_context_destroy(ctx);
+}
+
+TEST(planes_left_out_are_not_touched_and_cost_nothing)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(SIDE, SIDE);
+    test_shape shape = some_shape(1);
+    dist_field field = shape_field(&shape, 1, 1);
+    dist_images full = all_planes(&a);
+    CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &full, NULL), ctx);
+    long queries = shape.queries, gradients = shape.gradients;
+    CHECK(a.stats.queries == (unsigned long long)queries);
+    CHECK(a.stats.normal_queries == (unsigned long long)gradients && gradients > 0);
+    unsigned long long march = a.stats.queries - a.stats.normal_queries - a.stats.silhouette_queries;
+    for (int k = 0; k < 8; k++) {
+        dist_images out = all_planes(&b), none;
+        planes *fresh = &b;
+        memset(&none, 0, sizeof none);
+        none.stats = &b.stats;
+        if (k == 0) none.depth = out.depth;
+        if (k == 1) none.distance = out.distance;
+        if (k == 2) none.normal = out.normal;
+        if (k == 3) none.silhouette = out.silhouette;
+        if (k == 4) none.mask = out.mask;
+        if (k == 5) none.status = out.status;
+        if (k == 6) none.error = out.error;
+        shape.queries = shape.gradients = 0;
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &none, NULL), ctx);
+        CHECK(b.stats.normal_queries == (k == 2 ? a.stats.normal_queries : 0));
+        CHECK(b.stats.silhouette_queries == (k == 3 ? a.stats.silhouette_queries : 0));
+        CHECK(b.stats.queries == march + b.stats.normal_queries + b.stats.silhouette_queries);
+        CHECK(b.stats.queries == (unsigned long long)shape.queries);
+        const unsigned char *bytes = (const unsigned char *)fresh, *first = NULL;
+        size_t size = 0, touched = 0;
+        if (k == 0) first = (const unsigned char *)b.depth, size = sizeof(float) * SIDE * SIDE, CHECK_BYTES(size, a.depth, b.depth);
+        if (k == 1) first = (const unsigned char *)b.distance, size = sizeof(float) * SIDE * SIDE, CHECK_BYTES(size, a.distance, b.distance);
+        if (k == 2) first = (const unsigned char *)b.normal, size = sizeof(float) * 3 * SIDE * SIDE, CHECK_BYTES(size, a.normal, b.normal);
+        if (k == 3)
+            first = (const unsigned char *)b.silhouette, size = sizeof(float) * SIDE * SIDE, CHECK_BYTES(size, a.silhouette, b.silhouette);
+        if (k == 4) first = b.mask, size = SIDE * SIDE, CHECK_BYTES(size, a.mask, b.mask);
+        if (k == 5) first = b.status, size = SIDE * SIDE, CHECK_BYTES(size, a.status, b.status);
+        if (k == 6) first = (const unsigned char *)b.error, size = sizeof(float) * SIDE * SIDE, CHECK_BYTES(size, a.error, b.error);
+        for (size_t i = 0; i < offsetof(planes, stats); i++)
+            touched += bytes[i] != 0x5a && !(first && bytes + i >= first && bytes + i < first + size);
+        CHECK_EQUAL(0, touched);
+    }
+    dist_images nothing;
+    memset(&nothing, 0, sizeof nothing);
+    CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &nothing, NULL), ctx);
+    dist_context_destroy(ctx);
+}
+
+static void painted(void *user, int worker, size_t n, const float *points, float *color)
+{
+    (void)user;
+    (void)worker;
+    for (size_t i = 0; i < 3 * n; i++) color[i] = 0.5f + 0.5f * points[i];
+}
+
+TEST(color_is_the_fields_at_the_hit)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(48, 48);
+    test_shape shape = some_shape(0);
+    dist_field field = shape_field(&shape, 1, 1);
+    dist_render_desc how = plain_how();
+    dist_images out = all_planes(&a);
+    out.color = a.color;
+    CHECK_STATUS(DIST_UNSUPPORTED, dist_render(ctx, &field, &camera, NULL, &out, NULL), ctx);
+    CHECK_TEXT("color", dist_context_message(ctx));
+    dist_context_clear(ctx);
+    field.color_fn = painted;
+    how.background_color[0] = 0.25f;
+    how.background_color[2] = 2;
+    CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+    for (int i = 0; i < 48 * 48; i++) {
+        double o[3], d[3];
+        shape_pixel(&camera, i % 48, i / 48, o, d);
+        for (int k = 0; k < 3; k++)
+            CHECK_NEAR(a.mask[i] ? 0.5 + 0.5 * (o[k] + (double)a.distance[i] * d[k]) : (double)how.background_color[k],
+                       a.color[3 * i + k], 1e-6);
+    }
+    const dist_stats *s = &a.stats;
+    CHECK(s->queries == s->cone_queries + s->march_queries + s->refine_queries + s->silhouette_queries + s->normal_queries + s->hits);
+    dist_context_destroy(ctx);
+}
+
+TEST(normals_are_the_closed_form_by_either_way_in_either_space)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(SIDE, SIDE);
+    for (int k = 0; k < 3; k++) {
+        for (int mode = 0; mode < 2; mode++) {
+            for (int space = 0; space < 2; space++) {
+                test_shape shape = some_shape(k);
+                dist_field field = shape_field(&shape, 1, 1);
+                dist_render_desc how = plain_how();
+                dist_images out = all_planes(&a);
+                int hits = 0, off = 0;
+                how.normal_mode = mode;
+                how.normal_space = space;
+                CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+                for (int i = 0; i < SIDE * SIDE; i++) {
+                    double o[3], d[3], p[3], n[3], worst = 0;
+                    if (!a.mask[i]) continue;
+                    shape_pixel(&camera, i % SIDE, i / SIDE, o, d);
+                    for (int j = 0; j < 3; j++) p[j] = o[j] + (double)a.distance[i] * d[j];
+                    normal_of(&shape, p, n);
+                    for (int j = 0; j < 3; j++) {
+                        double expected = n[j];
+                        if (space == DIST_SPACE_CAMERA) {
+                            expected = 0;
+                            for (int m = 0; m < 3; m++) expected += (double)camera.rotation[3 * j + m] * n[m];
+                        }
+                        worst = fmax(worst, fabs(expected - (double)a.normal[3 * i + j]));
+                    }
+                    hits++;
+                    off += worst > (mode == DIST_NORMAL_DIFFERENCE ? 2e-3 : 2e-4);
+                }
+                CHECK(hits > 500);
+                CHECK(off * 50 <= hits * (k == 2)); /* within delta of the box's edges a difference sees both faces */
+                CHECK(a.stats.normal_queries == (unsigned long long)hits * (mode ? 6 : 1));
+            }
+        }
+    }
+    dist_context_destroy(ctx);
+}
+
+/* 31 */
+TEST(a_surface_without_slope_has_normal_zero_or_unit_and_nothing_is_nan)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(32, 32);
+    for (int kind = 0; kind < 2; kind++) {
+        test_shape shape = some_shape(0);
+        shape.power = kind ? -1 : 3;
+        dist_field field = shape_field(&shape, 1, 1);
+        dist_images out = all_planes(&a);
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, NULL), ctx);
+        for (int i = 0; i < 32 * 32; i++) {
+            const float *n = a.normal + 3 * i;
+            double length = shape_length((double)n[0], (double)n[1], (double)n[2]);
+            CHECK(test_finite((double)a.depth[i]) && test_finite((double)a.silhouette[i]) && test_finite((double)a.error[i]));
+            CHECK(length < 1e-6 || fabs(length - 1) < 1e-5);
+        }
+    }
+    dist_context_destroy(ctx);
+}
+
+/* ---- silhouette ------------------------------------------------------------------------------------------------------ */
+
+/* Smallest f along the part of a ray within the sphere, by 400 samples and golden sections. */
+static double least_along(const test_shape *shape, const double o[3], const double d[3], double t0, double t1)
+{
+    double best = t0, least = 1e30, h = (t1 - t0) / 400;
+    for (int i = 0; i <= 400; i++) {
+        double f = shape_along(shape, o, d, t0 + i * h);
+        if (f < least) least = f, best = t0 + i * h;
+    }
+    double low = fmax(best - h, t0), high = fmin(best + h, t1);
+    for (int i = 0; i < 40; i++) {
+        double u = low + 0.382 * (high - low), v = low + 0.618 * (high - low);
+        if (shape_along(shape, o, d, u) < shape_along(shape, o, d, v)) high = v;
+        else low = u;
+    }
+    return fmin(least, shape_along(shape, o, d, 0.5 * (low + high)));
+}
+
+/* Misses whose smallest f is below `reach` and whose value is off by more than 5e-3. */
+static void check_silhouette(double reach)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(SIDE, SIDE);
+    for (int k = 0; k < 3; k++) {
+        for (int cones = 0; cones < 2; cones++) {
+            test_shape shape = some_shape(k);
+            dist_field field = shape_field(&shape, 1, 1);
+            dist_render_desc how = plain_how();
+            dist_images out = all_planes(&a);
+            double worst = 0;
+            int misses = 0, off = 0;
+            how.no_cones = cones;
+            CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+            for (int i = 0; i < SIDE * SIDE; i++) {
+                double o[3], d[3], t0, t1;
+                shape_pixel(&camera, i % SIDE, i / SIDE, o, d);
+                if (a.mask[i] || a.status[i] != DIST_RAY_MISS || !shape_enter(o, d, 1, &t0, &t1)) continue;
+                double least = least_along(&shape, o, d, t0, t1), far = fabs(least - 5e-5 - (double)a.silhouette[i]);
+                if (least > reach) continue;
+                misses++;
+                off += far > 5e-3;
+                worst = fmax(worst, far);
+            }
+            int good = CHECK(misses > 100) & CHECK_EQUAL(0, off);
+            if (!good || test_state.verbose)
+                printf("    shape %d, %s: %d of %d misses off, worst %.1e\n", k, cones ? "no cones" : "cones", off, misses, worst);
+        }
+    }
+    dist_context_destroy(ctx);
+}
+
+TEST(silhouette_near_the_outline_is_the_smallest_f)
+{
+    check_silhouette(0.05);
+}
+
+TEST(silhouette_of_every_miss_is_the_smallest_f)
+{
+    check_silhouette(10);
+}
+
+/* 36 */
+TEST(silhouette_off_the_sphere_is_the_distance_to_it)
+{
+    dist_context *ctx = shape_context();
+    float eye[3] = {0, 0, 10}, at[3] = {4, 0, 0}, up[3] = {0, 1, 0};
+    dist_camera camera = dist_camera_look_at(64, 48, 0.8f, eye, at, up);
+    test_shape shape = some_shape(0);
+    dist_field field = shape_field(&shape, 1, 1);
+    for (int paper = 0; paper < 2; paper++) {
+        dist_render_desc how = plain_how();
+        dist_images out = all_planes(&a);
+        int outside = 0;
+        how.trace = paper ? DIST_TRACE_PAPER : DIST_TRACE_GUARDED;
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+        for (int i = 0; i < 64 * 48; i++) {
+            double o[3], d[3], along = 0;
+            shape_pixel(&camera, i % 64, i / 64, o, d);
+            for (int k = 0; k < 3; k++) along -= o[k] * d[k];
+            double off = shape_length(o[0] + along * d[0], o[1] + along * d[1], o[2] + along * d[2]) - 1;
+            if (off < 1e-6) continue;
+            outside++;
+            CHECK_NEAR(off, a.silhouette[i], 1e-6 * (1 + off));
+            CHECK_EQUAL(DIST_RAY_MISS, a.status[i]);
+        }
+        CHECK(outside > 1000);
+    }
+    dist_context_destroy(ctx);
+}
+
+/* 34: the outline moves over pixels, the value goes through 0 without a jump. */
+TEST(silhouette_is_continuous_and_the_mask_changes_by_single_pixels)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(1, 64);
+    double last[64];
+    unsigned char mask[64];
+    int changes = 0, jumps = 0;
+    camera.fx = camera.fy = 60;
+    camera.cy = 31.5f;
+    for (int k = 0; k < 200; k++) {
+        test_shape shape = shape_make(SHAPE_SPHERE, 0.5 + 4e-4 * k, 0, 0, 0);
+        dist_field field = shape_field(&shape, 1, 1);
+        dist_images out = all_planes(&a);
+        int moved = 0;
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, NULL), ctx);
+        for (int i = 0; i < 64; i++) {
+            if (k > 0) moved += a.mask[i] != mask[i];
+            if (k > 0 && a.silhouette[i] < 0.1f) jumps += fabs((double)a.silhouette[i] - last[i]) > 2e-3;
+            last[i] = (double)a.silhouette[i];
+            mask[i] = a.mask[i];
+        }
+        CHECK(moved <= 2);
+        changes += moved;
+    }
+    CHECK_EQUAL(0, jumps);
+    CHECK(changes >= 1);
+    /* one ulp of the pose */
+    test_shape shape = some_shape(0);
+    dist_field field = shape_field(&shape, 1, 1);
+    for (int k = 0; k < 40; k++) {
+        dist_images out = all_planes(&a), again = all_planes(&b);
+        int moved = 0;
+        dist_camera other = camera;
+        other.translation[0] = nextafterf(camera.translation[0], 10);
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, NULL), ctx);
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &other, NULL, &again, NULL), ctx);
+        for (int i = 0; i < 64; i++) moved += a.mask[i] != b.mask[i];
+        CHECK(moved <= 1);
+        camera.translation[0] += 0.0007f;
+    }
+    dist_context_destroy(ctx);
+}
+
+/* ---- size, scale, distance ---------------------------------------------------------------------------------------------- */
+
+/* 12 */
+TEST(scale_of_the_world_changes_nothing)
+{
+    dist_context *ctx = shape_context();
+    const double scales[4] = {1e-6, 1e-3, 1e3, 1e6};
+    dist_camera camera = shape_camera(48, 48);
+    float unit[5] = {0, 0, 0, 0.6f, 0.2f}, numbers[5];
+    dist_field field = dist_field_torus(unit);
+    dist_images out = all_planes(&a);
+    CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, NULL), ctx);
+    for (int k = 0; k < 4; k++) {
+        dist_camera far = camera;
+        dist_images other = all_planes(&b);
+        int masks = 0, off = 0;
+        for (int i = 0; i < 5; i++) numbers[i] = (float)((double)unit[i] * scales[k]);
+        for (int i = 0; i < 3; i++) far.translation[i] = (float)((double)camera.translation[i] * scales[k]);
+        field = dist_field_torus(numbers);
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &far, NULL, &other, NULL), ctx);
+        for (int i = 0; i < 48 * 48; i++) {
+            masks += a.mask[i] != b.mask[i];
+            if (!a.mask[i] || !b.mask[i]) continue;
+            off += fabs((double)b.depth[i] / scales[k] - (double)a.depth[i]) > 1e-5 + (double)a.error[i] + (double)b.error[i] / scales[k];
+            for (int j = 0; j < 3; j++) off += fabs((double)(a.normal[3 * i + j] - b.normal[3 * i + j])) > 1e-3;
+        }
+        CHECK_EQUAL(0, off);
+        CHECK(masks <= 1);
+        if (test_state.verbose) printf("    scale %g: %d masks differ, %d values off\n", scales[k], masks, off);
+    }
+    dist_context_destroy(ctx);
+}
+
+/* 11 */
+TEST(far_cameras_see_what_double_sees)
+{
+    dist_context *ctx = shape_context();
+    const double away[3] = {1e2, 1e4, 1e6};
+    for (int k = 0; k < 3; k++) {
+        double length = shape_length(1.4, 1, 2);
+        float eye[3] = {(float)(away[k] * 1.4 / length), (float)(away[k] / length), (float)(away[k] * 2 / length)};
+        float at[3] = {0, 0, 0}, up[3] = {0, 1, 0};
+        dist_camera camera = dist_camera_look_at(64, 64, (float)(2.2 / away[k]), eye, at, up);
+        test_shape shape = some_shape(1);
+        dist_field field = shape_field(&shape, 1, 1);
+        dist_images out = all_planes(&a);
+        int wrong = 0, hits = 0, outline = 0;
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, NULL), ctx);
+        for (int i = 0; i < 64 * 64; i++) {
+            double o[3], d[3], t0, t1;
+            shape_pixel(&camera, i % 64, i / 64, o, d);
+            if (!shape_enter(o, d, 1, &t0, &t1)) {
+                wrong += a.mask[i];
+                continue;
+            }
+            shape_crossing c = shape_cross(&shape, o, d, t0, t1, 1, 1e-5, 1e-4);
+            if (c.touched || (c.crosses && c.below < 1e-5) || (!c.crosses && c.least < 1e-4)) {
+                outline++;
+                continue;
+            }
+            wrong += c.crosses != a.mask[i];
+            if (!c.crosses || !a.mask[i]) continue;
+            hits++;
+            CHECK_NEAR(c.t, a.distance[i], (double)a.error[i] + 2e-6 / fmax(fabs(c.slope), 0.05) + 6e-8 * c.t);
+        }
+        CHECK_EQUAL(0, wrong);
+        CHECK(hits > 500 && outline < 40);
+    }
+    dist_context_destroy(ctx);
+}
+
+/* 13 */
+TEST(focal_lengths_from_a_thousandth_to_a_million_are_finite)
+{
+    dist_context *ctx = shape_context();
+    const float focal[6] = {1e-3f, 1e-1f, 1, 1e3f, 1e5f, 1e6f};
+    for (int k = 0; k < 6; k++) {
+        dist_camera camera = shape_camera(40, 30);
+        test_shape shape = some_shape(0);
+        dist_field field = shape_field(&shape, 1, 1);
+        dist_images out = all_planes(&a);
+        camera.fx = camera.fy = focal[k];
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, NULL), ctx);
+        int wrong = 0;
+        for (int i = 0; i < 40 * 30; i++) {
+            double o[3], d[3], along = 0;
+            CHECK(test_finite((double)a.depth[i]) && test_finite((double)a.distance[i]) && test_finite((double)a.silhouette[i]));
+            CHECK(test_finite((double)a.normal[3 * i]) && test_finite((double)a.error[i]) && a.status[i] != DIST_RAY_NOT_FINITE);
+            shape_pixel(&camera, i % 40, i / 40, o, d);
+            CHECK_NEAR(1, shape_length(d[0], d[1], d[2]), 1e-12);
+            for (int j = 0; j < 3; j++) along -= o[j] * d[j];
+            double off = shape_length(o[0] + along * d[0], o[1] + along * d[1], o[2] + along * d[2]) - 0.6;
+            if (fabs(off) > 1e-4) wrong += (off < 0 && along > 0) != a.mask[i];
+        }
+        CHECK_EQUAL(0, wrong);
+    }
+    dist_context_destroy(ctx);
+}
+
+/* 25, 26, 27: every pixel of a picture of any shape is the same as by itself. */
+TEST(pictures_of_any_shape_agree_with_single_pixels)
+{
+    dist_context *ctx = shape_context();
+    const int sizes[10][2] = {{1, 1}, {1, 4096}, {4096, 1}, {2, 3}, {5, 7}, {31, 33}, {33, 31}, {65, 2}, {63, 129}, {97, 1}};
+    for (int k = 0; k < 10; k++) {
+        int w = sizes[k][0], h = sizes[k][1], step = 1 + w * h / 150;
+        float eye[3] = {1.2f, 0.9f, 1.8f}, at[3] = {0, 0, 0}, up[3] = {0, 1, 0};
+        dist_camera camera = dist_camera_look_at(w, h, 0.8f, eye, at, up);
+        test_shape shape = some_shape(1);
+        dist_field field = shape_field(&shape, 1, 1);
+        dist_render_desc how = plain_how();
+        dist_images out = all_planes(&a);
+        int wrong = 0, hits = 0;
+        camera.fx = 0.9f * (float)(w > 8 ? w : 8);
+        camera.fy = 1.1f * (float)(h > 8 ? h : 8);
+        camera.skew = 0.3f;
+        camera.cx += 0.1f * (float)w;
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, NULL), ctx);
+        for (int i = 0; i < w * h; i += step) {
+            dist_camera one = camera;
+            dist_images single = all_planes(&b);
+            double o[3], d[3], t0, t1;
+            one.width = one.height = 1;
+            one.cx -= (float)(i % w);
+            one.cy -= (float)(i / w);
+            how.no_cones = 1;
+            CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &one, &how, &single, NULL), ctx);
+            shape_pixel(&camera, i % w, i / w, o, d);
+            hits += a.mask[i];
+            if (a.mask[i] && b.mask[0]) {
+                wrong += fabs((double)a.distance[i] - (double)b.distance[0]) > (double)a.error[i] + (double)b.error[0] + 2e-5;
+            } else if (a.mask[i] != b.mask[0]) {
+                shape_crossing c;
+                memset(&c, 0, sizeof c);
+                if (shape_enter(o, d, 1, &t0, &t1)) c = shape_cross(&shape, o, d, t0, t1, 1, 1e-5, 1e-4);
+                wrong += !(c.touched || (c.crosses && c.below < 1e-4) || (!c.crosses && c.least < 1e-4));
+            }
+        }
+        CHECK_EQUAL(0, wrong);
+        CHECK(hits > 0 || w * h < 40);
+    }
+    dist_context_destroy(ctx);
+}
+
+TEST(a_picture_and_its_crop_agree)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(90, 70), crop = camera;
+    test_shape shape = some_shape(2);
+    dist_field field = shape_field(&shape, 1, 1);
+    for (int cones = 0; cones < 2; cones++) {
+        dist_render_desc how = plain_how();
+        dist_images out = all_planes(&a), part = all_planes(&b);
+        int off = 0, masks = 0;
+        how.no_cones = cones;
+        crop.width = 37;
+        crop.height = 29;
+        crop.cx = camera.cx - 30;
+        crop.cy = camera.cy - 21;
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &crop, &how, &part, NULL), ctx);
+        for (int i = 0; i < 37 * 29; i++) {
+            int j = (21 + i / 37) * 90 + 30 + i % 37;
+            masks += a.mask[j] != b.mask[i];
+            if (a.mask[j] && b.mask[i])
+                off += fabs((double)(a.distance[j] - b.distance[i])) > (double)a.error[j] + (double)b.error[i] + 1e-6;
+        }
+        CHECK_EQUAL(0, off);
+        CHECK(masks <= 1);
+    }
+    dist_context_destroy(ctx);
+}
+
+/* 25: the largest picture is refused by memory, not by an overflow. */
+TEST(huge_tapes_are_refused_or_had_without_overflow)
+{
+    test_allocator allocator;
+    memset(&allocator, 0, sizeof allocator);
+    dist_context_desc desc = test_context_desc();
+    desc.workers = 1;
+    desc.allocator = test_allocator_hook(&allocator);
+    dist_context *ctx = dist_context_create(&desc);
+    dist_camera camera = shape_camera(65536, 65536);
+    dist_render_desc how = plain_how();
+    how.trace = DIST_TRACE_PAPER;
+    how.samples = 8;
+    allocator.fail_at = allocator.requests + 3; /* partial sums, tape, then the first plane */
+    allocator.fail_onwards = 1;
+    CHECK(dist_tape_create(ctx, &camera, &how) == NULL);
+    CHECK_STATUS(DIST_OUT_OF_MEMORY, dist_context_status(ctx), ctx);
+    CHECK_TEXT("out of memory", dist_context_message(ctx));
+    CHECK_TEXT(sizeof(size_t) > 4 ? "17179869184" : "out of memory", dist_context_message(ctx));
+    dist_context_destroy(ctx);
+    CHECK_EQUAL(0, allocator.live_blocks);
+}
+
+/* ---- the same bits --------------------------------------------------------------------------------------------------------- */
+
+/* 40 */
+TEST(workers_and_order_of_tasks_change_no_bit)
+{
+    const int workers[5] = {1, 2, 3, 7, 64};
+    dist_net_desc net_desc;
+    memset(&net_desc, 0, sizeof net_desc);
+    net_desc.layers = 3;
+    net_desc.width = 24;
+    net_desc.code_size = 4;
+    net_desc.geometric = 1;
+    net_desc.seed = 7;
+    dist_render_desc how = plain_how();
+    static planes first;
+    for (int paper = 0; paper < 2; paper++) {
+        how.trace = paper ? DIST_TRACE_PAPER : DIST_TRACE_GUARDED;
+        for (int k = 0; k < 5; k++) {
+            test_scheduler scheduler;
+            dist_context_desc desc = test_context_desc();
+            scheduler.workers = workers[k];
+            scheduler.calls = k;
+            desc.workers = workers[k];
+            if (k > 0) desc.scheduler = test_scheduler_hook(&scheduler);
+            dist_context *ctx = dist_context_create(&desc);
+            dist_net *net = dist_net_create(ctx, &net_desc);
+            dist_shape *shape = dist_shape_create(ctx, net, NULL);
+            dist_field field = dist_shape_field(shape);
+            dist_camera camera = shape_camera(90, 75);
+            dist_images out = all_planes(k ? &b : &first);
+            if (k == 0 && !paper) memset(&a, 0, sizeof a);
+            CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+            CHECK_EQUAL(workers[k], dist_context_workers(ctx));
+            if (k > 0) CHECK_BYTES(offsetof(planes, stats), &first, &b);
+            if (k > 0) CHECK_BYTES(sizeof(dist_stats), &first.stats, &b.stats);
+            else CHECK(first.stats.hits > 100);
+            dist_shape_destroy(shape);
+            dist_net_destroy(net);
+            dist_context_destroy(ctx);
+        }
+    }
+}
+
+/* ---- counts ----------------------------------------------------------------------------------------------------------------- */
+
+TEST(counts_add_up)
+{
+    dist_context *ctx = shape_context();
+    for (int k = 0; k < 12; k++) {
+        dist_camera camera = shape_camera(64, 48);
+        test_shape shape = some_shape(k % 3);
+        dist_field field = shape_field(&shape, 1, 1);
+        dist_render_desc how = plain_how();
+        dist_images out = all_planes(&a);
+        unsigned long long seen[6] = {0, 0, 0, 0, 0, 0}, hits = 0, met = 0;
+        float error = 0;
+        how.trace = k >= 9 ? DIST_TRACE_PAPER : DIST_TRACE_GUARDED;
+        how.max_steps = k >= 3 && k < 6 ? 8 : 0;
+        if (k >= 6 && k < 9) camera = dist_camera_look_at(64, 48, 1.5f, (const float[3]){0.3f, 0.1f, 0.2f}, (const float[3]){1, 0, 0},
+                                                          (const float[3]){0, 1, 0});
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+        for (int i = 0; i < 64 * 48; i++) {
+            double o[3], d[3], t0, t1;
+            if (CHECK(a.status[i] <= DIST_RAY_NOT_FINITE)) seen[a.status[i]]++;
+            hits += a.mask[i];
+            if (a.status[i] == DIST_RAY_HIT && a.error[i] > error) error = a.error[i];
+            shape_pixel(&camera, i % 64, i / 64, o, d);
+            met += (unsigned)shape_enter(o, d, 1, &t0, &t1);
+        }
+        const dist_stats *s = &a.stats;
+        CHECK_EQUAL(64 * 48, s->rays);
+        CHECK(s->rays_in_sphere + 2 >= met && met + 2 >= s->rays_in_sphere);
+        CHECK_EQUAL(hits, s->hits);
+        CHECK_EQUAL(seen[DIST_RAY_UNRESOLVED], s->unresolved);
+        CHECK_EQUAL(seen[DIST_RAY_INSIDE], s->inside);
+        CHECK_EQUAL(seen[DIST_RAY_PLATEAU], s->plateau);
+        CHECK_EQUAL(seen[DIST_RAY_NOT_FINITE], s->not_finite);
+        CHECK_EQUAL(s->queries, s->cone_queries + s->march_queries + s->refine_queries + s->silhouette_queries + s->normal_queries);
+        CHECK_EQUAL(shape.queries, s->queries);
+        CHECK_NEAR(error, s->error, 0);
+        CHECK_NEAR(1, s->lipschitz, 0);
+        CHECK(s->epsilon > 0 && s->epsilon <= 5.1e-5f);
+        CHECK_NEAR(0, s->operations, 0);
+        CHECK(s->capped == 0 && s->backward_points == 0 && s->skipped == 0);
+        if (k >= 3 && k < 6) CHECK(s->unresolved > 0);
+    }
+    dist_context_destroy(ctx);
+}
+
+TEST(operations_done_are_no_more_than_a_dense_net_would_do)
+{
+    dist_context *ctx = shape_context();
+    dist_net_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.layers = 4;
+    desc.width = 64;
+    desc.geometric = 1;
+    dist_net *net = dist_net_create(ctx, &desc);
+    dist_shape *shape = dist_shape_create(ctx, net, NULL);
+    dist_field field = dist_shape_field(shape);
+    dist_camera camera = shape_camera(48, 48);
+    dist_images out = all_planes(&a);
+    CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, NULL), ctx);
+    CHECK(a.stats.hits > 50);
+    CHECK(a.stats.operations > 0 && a.stats.operations_done > 0);
+    CHECK(a.stats.operations_done <= a.stats.operations);
+    CHECK(a.stats.operations >= (double)a.stats.queries * (double)dist_net_operations(net, 1) * 0.999);
+    dist_shape_destroy(shape);
+    dist_net_destroy(net);
+    dist_context_destroy(ctx);
+}
+
+/* ---- refusals, inside, NaN -------------------------------------------------------------------------------------------------- */
+
+TEST(a_tape_is_for_its_size_and_trace)
+{
+    dist_context *ctx = shape_context(), *other = shape_context();
+    dist_camera camera = shape_camera(16, 12), wide = shape_camera(12, 16);
+    test_shape shape = some_shape(0);
+    dist_field field = shape_field(&shape, 1, 1);
+    dist_render_desc paper = plain_how(), more = plain_how();
+    paper.trace = more.trace = DIST_TRACE_PAPER;
+    more.samples = 3;
+    dist_tape *tape = dist_tape_create(ctx, &camera, NULL), *paper_tape = dist_tape_create(ctx, &camera, &paper);
+    dist_images out = all_planes(&a);
+    CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, tape), ctx);
+    CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &paper, &out, paper_tape), ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_render(ctx, &field, &wide, NULL, &out, tape), ctx);
+    CHECK_TEXT("size", dist_context_message(ctx));
+    dist_context_clear(ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_render(ctx, &field, &camera, &paper, &out, tape), ctx);
+    CHECK_TEXT("trace", dist_context_message(ctx));
+    dist_context_clear(ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_render(ctx, &field, &camera, &more, &out, paper_tape), ctx);
+    CHECK_TEXT("samples", dist_context_message(ctx));
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_render(other, &field, &camera, NULL, &out, tape), other);
+    CHECK_TEXT("another context", dist_context_message(other));
+    dist_tape_destroy(tape);
+    dist_tape_destroy(paper_tape);
+    dist_tape_destroy(NULL);
+    dist_context_destroy(ctx);
+    dist_context_destroy(other);
+}
+
+TEST(a_field_without_adjoint_renders_but_its_gradient_is_refused)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(16, 12);
+    test_shape shape = some_shape(0);
+    dist_field field = shape_field(&shape, 1, 1);
+    dist_tape *tape = dist_tape_create(ctx, &camera, NULL);
+    dist_images out = all_planes(&a), d_out;
+    dist_gradients grads;
+    float d_depth[16 * 12], d_code[4] = {1, 2, 3, 4}, rotation[3] = {0, 0, 0};
+    for (int i = 0; i < 16 * 12; i++) d_depth[i] = 1;
+    memset(&d_out, 0, sizeof d_out);
+    memset(&grads, 0, sizeof grads);
+    d_out.depth = d_depth;
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_render_backward(ctx, tape, &d_out, &grads), ctx); /* not rendered yet */
+    CHECK_TEXT("dist_render_backward: tape is empty", dist_context_message(ctx));
+    dist_context_clear(ctx);
+    CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, tape), ctx);
+    grads.code = d_code;
+    for (int k = 0; k < 2; k++) {
+        field.code_size = k ? 4 : 0;
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, tape), ctx);
+        CHECK_STATUS(DIST_BAD_ARGUMENT, dist_render_backward(ctx, tape, &d_out, &grads), ctx);
+        CHECK_TEXT("adjoint_fn", dist_context_message(ctx));
+        dist_context_clear(ctx);
+    }
+    CHECK(d_code[0] == 1 && d_code[3] == 4);
+    grads.code = NULL;
+    grads.weights = d_code;
+    CHECK_STATUS(DIST_UNSUPPORTED, dist_render_backward(ctx, tape, &d_out, &grads), ctx);
+    CHECK_TEXT("weights", dist_context_message(ctx));
+    dist_context_clear(ctx);
+    grads.weights = NULL;
+    grads.rotation = rotation; /* the camera's needs grad f alone */
+    CHECK_STATUS(DIST_OK, dist_render_backward(ctx, tape, &d_out, &grads), ctx);
+    CHECK(rotation[0] != 0);
+    dist_tape_destroy(tape);
+    dist_context_destroy(ctx);
+}
+
+TEST(render_refuses_null_and_garbage_with_a_sentence)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(8, 8);
+    test_shape shape = some_shape(0);
+    for (int k = 0; k < 8; k++) {
+        dist_field field = shape_field(&shape, 1, 1);
+        dist_render_desc how = plain_how();
+        dist_images out = all_planes(&a);
+        const char *part = "field";
+        if (k == 2) field.radius = -1, part = "radius";
+        if (k == 3) field.lipschitz = -1, part = "lipschitz";
+        if (k == 4) how.paper_row = 4, part = "paper_row";
+        if (k == 5) how.gradient_cap = 2, part = "gradient_cap";
+        if (k == 6) how.normal_space = -1, part = "normal_space";
+        if (k == 7) part = "out is NULL";
+        if (k == 1) field.eval_fn = NULL;
+        dist_context_clear(ctx);
+        CHECK_STATUS(DIST_BAD_ARGUMENT, dist_render(ctx, k ? &field : NULL, &camera, &how, k == 7 ? NULL : &out, NULL), ctx);
+        CHECK_TEXT("dist_render: ", dist_context_message(ctx));
+        CHECK_TEXT(part, dist_context_message(ctx));
+        CHECK_EQUAL(0x5a, a.mask[0]);
+    }
+    CHECK_EQUAL(DIST_BAD_ARGUMENT, dist_render(NULL, NULL, NULL, NULL, NULL, NULL));
+    CHECK_EQUAL(DIST_BAD_ARGUMENT, dist_render_backward(NULL, NULL, NULL, NULL));
+    dist_context_destroy(ctx);
+}
+
+/* 8 */
+TEST(inside_modes_are_what_the_desc_says)
+{
+    dist_context *ctx = shape_context();
+    float eye[3] = {0.1f, 0.2f, -0.1f}, at[3] = {1, 0, 0}, up[3] = {0, 1, 0};
+    dist_camera camera = dist_camera_look_at(32, 24, 1.2f, eye, at, up);
+    for (int mode = 0; mode < 3; mode++) {
+        test_shape shape = some_shape(0);
+        dist_field field = shape_field(&shape, 1, 1);
+        dist_render_desc how = plain_how();
+        dist_images out = all_planes(&a);
+        how.inside = mode;
+        how.background = 9;
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+        for (int i = 0; i < 32 * 24; i++) {
+            double o[3], d[3], along = 0;
+            shape_pixel(&camera, i % 32, i / 32, o, d);
+            for (int k = 0; k < 3; k++) along -= o[k] * d[k];
+            double off = shape_length(o[0] + along * d[0], o[1] + along * d[1], o[2] + along * d[2]);
+            double exit = along + sqrt(0.36 - off * off);
+            CHECK_EQUAL(mode == DIST_INSIDE_EXIT ? DIST_RAY_HIT : DIST_RAY_INSIDE, a.status[i]);
+            CHECK_EQUAL(mode != DIST_INSIDE_BACKGROUND, a.mask[i]);
+            CHECK((a.silhouette[i] < 0) == a.mask[i]);
+            double expected = mode == DIST_INSIDE_BACKGROUND ? 9 : mode == DIST_INSIDE_HIT ? 0 : exit;
+            CHECK_NEAR(expected, a.distance[i], (double)a.error[i] + 1e-6);
+        }
+    }
+    dist_context_destroy(ctx);
+}
+
+/* 22 */
+TEST(nan_from_the_field_spoils_only_its_pixels)
+{
+    dist_context *ctx = shape_context();
+    float eye[3] = {0, 0, 2.4f}, at[3] = {0, 0, 0}, up[3] = {0, 1, 0};
+    dist_camera camera = dist_camera_look_at(64, 64, 0.9f, eye, at, up);
+    for (int k = 0; k < 4; k++) {
+        test_shape shape = some_shape(0);
+        dist_field field = shape_field(&shape, 1, 1);
+        dist_render_desc how = plain_how();
+        dist_images out = all_planes(&a), spoilt = all_planes(&b);
+        how.trace = k / 2;
+        how.normal_mode = k % 2;
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+        shape.poison = 0.2;
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &spoilt, NULL), ctx);
+        int bad = 0, changed = 0;
+        for (int i = 0; i < 64 * 64; i++) {
+            double o[3], d[3], along = 0;
+            CHECK(test_finite((double)b.depth[i]) && test_finite((double)b.distance[i]) && test_finite((double)b.silhouette[i]));
+            CHECK(test_finite((double)b.error[i]) && test_finite((double)b.normal[3 * i]) && test_finite((double)b.normal[3 * i + 2]));
+            if (b.status[i] == DIST_RAY_NOT_FINITE) {
+                bad++;
+                CHECK_EQUAL(0, b.mask[i]);
+                continue;
+            }
+            shape_pixel(&camera, i % 64, i / 64, o, d);
+            for (int j = 0; j < 3; j++) along += ((j == 2 ? 0.5 : 0) - o[j]) * d[j];
+            double off = shape_length(o[0] + along * d[0], o[1] + along * d[1], o[2] + along * d[2] - 0.5);
+            changed += off > 0.21 && (a.mask[i] != b.mask[i] || fabs((double)(a.depth[i] - b.depth[i])) > 1e-4);
+        }
+        CHECK(bad > 50);
+        CHECK_EQUAL(bad, b.stats.not_finite);
+        if (k < 2) CHECK_EQUAL(0, changed); /* the paper's coarse rays pass on what they met */
+    }
+    dist_context_destroy(ctx);
+}
+
+/* 20 */
+TEST(dead_fields_are_all_miss_all_inside_or_plateau)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(24, 24);
+    const double values[3] = {0.5, -0.5, 0};
+    const int status[3] = {DIST_RAY_MISS, DIST_RAY_INSIDE, DIST_RAY_PLATEAU};
+    for (int k = 0; k < 3; k++) {
+        test_shape shape = shape_make(SHAPE_CONSTANT, values[k], 0, 0, 0);
+        dist_field field = shape_field(&shape, 1, 1);
+        dist_images out = all_planes(&a);
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, NULL), ctx);
+        for (int i = 0; i < 24 * 24; i++) {
+            double o[3], d[3], t0, t1;
+            shape_pixel(&camera, i % 24, i / 24, o, d);
+            CHECK_EQUAL(0, a.mask[i]);
+            CHECK_EQUAL(shape_enter(o, d, 1, &t0, &t1) ? status[k] : DIST_RAY_MISS, a.status[i]);
+            CHECK(a.silhouette[i] > 0 && test_finite((double)a.silhouette[i]));
+        }
+    }
+    dist_context_destroy(ctx);
+}
+
+int main(int argc, char **argv)
+{
+    test_begin(argc, argv);
+    RUN(planes_mean_what_the_interface_says);
+    RUN(planes_left_out_are_not_touched_and_cost_nothing);
+    RUN(color_is_the_fields_at_the_hit);
+    RUN(normals_are_the_closed_form_by_either_way_in_either_space);
+    RUN(a_surface_without_slope_has_normal_zero_or_unit_and_nothing_is_nan);
+    RUN(silhouette_near_the_outline_is_the_smallest_f);
+    RUN(silhouette_of_every_miss_is_the_smallest_f);
+    RUN(silhouette_off_the_sphere_is_the_distance_to_it);
+    RUN(silhouette_is_continuous_and_the_mask_changes_by_single_pixels);
+    RUN(scale_of_the_world_changes_nothing);
+    RUN(far_cameras_see_what_double_sees);
+    RUN(focal_lengths_from_a_thousandth_to_a_million_are_finite);
+    RUN(pictures_of_any_shape_agree_with_single_pixels);
+    RUN(a_picture_and_its_crop_agree);
+    RUN(huge_tapes_are_refused_or_had_without_overflow);
+    RUN(workers_and_order_of_tasks_change_no_bit);
+    RUN(counts_add_up);
+    RUN(operations_done_are_no_more_than_a_dense_net_would_do);
+    RUN(a_tape_is_for_its_size_and_trace);
+    RUN(a_field_without_adjoint_renders_but_its_gradient_is_refused);
+    RUN(render_refuses_null_and_garbage_with_a_sentence);
+    RUN(inside_modes_are_what_the_desc_says);
+    RUN(nan_from_the_field_spoils_only_its_pixels);
+    RUN(dead_fields_are_all_miss_all_inside_or_plateau);
+    return test_report();
+}

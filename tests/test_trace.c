@@ -1,0 +1,1211 @@
+/* SPDX-License-Identifier: MIT-0
+   Both tracers against fields worked out in double: what is hit, how far off, what is said of it, and at what price. Numbers in
+   comments are rows of the table of hard cases. */
+#include "shapes.h"
+
+enum { SIDE = 128, PIXELS = SIDE * SIDE };
+
+typedef struct picture {
+    float distance[PIXELS], error[PIXELS];
+    unsigned char mask[PIXELS], status[PIXELS];
+    dist_stats stats;
+} picture;
+
+static picture picture_a, picture_b;
+
+static dist_status picture_render(dist_context *ctx, const dist_field *field, const dist_camera *camera, const dist_render_desc *how,
+                                  picture *p)
+{
+    dist_images out;
+    memset(&out, 0, sizeof out);
+    out.distance = p->distance;
+    out.error = p->error;
+    out.mask = p->mask;
+    out.status = p->status;
+    out.stats = &p->stats;
+    return dist_render(ctx, field, camera, how, &out, NULL);
+}
+
+static dist_render_desc plain_how(void)
+{
+    dist_render_desc how;
+    memset(&how, 0, sizeof how);
+    return how;
+}
+
+static float test_nan(void)
+{
+    uint32_t bits = 0x7fc00000u;
+    float nan;
+    memcpy(&nan, &bits, sizeof nan);
+    return nan;
+}
+
+/* A picture against the crossings in double. */
+typedef struct verdict {
+    int crossing; /* pixels whose ray certainly crosses */
+    int missed;   /* of them, those neither hit nor reported as unresolved */
+    int spent;    /* of them, those reported as unresolved */
+    int phantom;  /* hits of rays that keep clear of the surface */
+    int outline;  /* rays that barely touch: anything goes */
+    int judged;   /* hits whose distance is judged */
+    int broken;   /* of them, those farther off than their error bound and float's rounding */
+    double worst; /* distance off */
+    int unresolved;
+} verdict;
+
+static verdict judge(const test_shape *shape, const dist_camera *camera, double radius, double lipschitz, double step, const picture *p)
+{
+    verdict v;
+    memset(&v, 0, sizeof v);
+    double slope = shape->slope > 0 ? shape->slope : 1, epsilon = 5e-5 * radius / slope, shallow = 2e-6 * radius;
+    for (int i = 0; i < camera->width * camera->height; i++) {
+        double o[3], d[3], t0, t1;
+        shape_pixel(camera, i % camera->width, i / camera->width, o, d);
+        if (!shape_enter(o, d, radius, &t0, &t1)) {
+            v.phantom += p->mask[i];
+            continue;
+        }
+        shape_crossing c = shape_cross(shape, o, d, t0, t1, lipschitz, step, epsilon);
+        v.unresolved += p->status[i] == DIST_RAY_UNRESOLVED;
+        if (c.crosses && c.below > shallow) {
+            v.crossing++;
+            v.missed += !p->mask[i] && p->status[i] != DIST_RAY_UNRESOLVED;
+            v.spent += p->status[i] == DIST_RAY_UNRESOLVED;
+        } else if (c.crosses || c.least < 1.5 * epsilon) {
+            v.outline++;
+            continue;
+        } else {
+            v.phantom += p->mask[i];
+        }
+        if (!p->mask[i] || !c.crosses || c.touched) continue;
+        /* f is known to half a float's spacing, so t is to that over the slope along the ray. */
+        double off = fabs((double)p->distance[i] - c.t), rounding = 2.5e-7 * c.t + 3e-7 * radius + 6e-8 / fmax(fabs(c.slope), 1e-3);
+        v.judged++;
+        v.worst = fmax(v.worst, off);
+        v.broken += off > (double)p->error[i] + rounding;
+    }
+    return v;
+}
+
+typedef struct shape_case {
+    const char *name;
+    test_shape shape;
+    double radius, lipschitz; /* of the field */
+    double exact;             /* Lipschitz bound of the exact shape */
+} shape_case;
+
+enum { CASES = 9 };
+
+static void shape_cases(shape_case c[CASES])
+{
+    memset(c, 0, CASES * sizeof *c);
+    for (int i = 0; i < CASES; i++) {
+        c[i].radius = c[i].lipschitz = c[i].exact = 1;
+    }
+    c[0].name = "sphere";
+    c[0].shape = shape_make(SHAPE_SPHERE, 0.7, 0, 0, 0);
+    c[1].name = "torus";
+    c[1].shape = shape_make(SHAPE_TORUS, 0.6, 0.2, 0, 0);
+    c[2].name = "box";
+    c[2].shape = shape_make(SHAPE_BOX, 0.4, 0.5, 0.3, 0);
+    c[3] = c[1];
+    c[3].name = "torus of slope 0.5";
+    c[3].shape.slope = 0.5;
+    c[4] = c[1];
+    c[4].name = "torus of slope 2";
+    c[4].shape.slope = 2;
+    c[4].lipschitz = 2;
+    c[5] = c[1];
+    c[5].name = "torus clamped at 0.1";
+    c[5].shape.clamp = 0.1;
+    c[6] = c[0];
+    c[6].name = "bumps";
+    c[6].shape = shape_make(SHAPE_BUMPY, 0.7, 0.05, 12, 0);
+    c[6].exact = c[6].lipschitz = 1.6;
+    c[7] = c[2];
+    c[7].name = "box clamped at 0.1";
+    c[7].shape.clamp = 0.1;
+    c[8].name = "shells";
+    c[8].shape = shape_make(SHAPE_SHELLS, 0.02, 0, 0, 0);
+}
+
+static int side(void)
+{
+    return test_quick() ? 48 : SIDE;
+}
+
+/* A spent budget is reported, and rare: rays that graze a field of half the slope. */
+TEST(every_crossing_is_hit_and_999_of_1000_within_the_error_bound)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(side(), side());
+    shape_case cases[CASES];
+    shape_cases(cases);
+    for (int k = 0; k < CASES; k++) {
+        dist_field field = shape_field(&cases[k].shape, cases[k].radius, cases[k].lipschitz);
+        CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, NULL, &picture_a), ctx);
+        verdict v = judge(&cases[k].shape, &camera, cases[k].radius, cases[k].exact, 1e-5, &picture_a);
+        int good = CHECK_EQUAL(0, v.missed) & CHECK_EQUAL(0, v.phantom) & CHECK(v.broken * 1000 <= v.judged) &
+                   CHECK(v.spent * 500 <= v.crossing + 1500) & CHECK(v.judged > v.crossing * 9 / 10) & CHECK(v.outline < v.crossing / 50 + 10);
+        if (!good || test_state.verbose)
+            printf("    %s: crossing %d, missed %d, phantom %d, outline %d, judged %d, off by more than the bound %d, worst %.1e, "
+                   "unresolved %d, queries %llu\n",
+                   cases[k].name, v.crossing, v.missed, v.phantom, v.outline, v.judged, v.broken, v.worst, v.spent,
+                   picture_a.stats.queries);
+    }
+    dist_context_destroy(ctx);
+}
+
+/* 17 */
+TEST(no_plate_however_thin_is_missed)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(side(), side());
+    const double thin[5] = {1e-1, 1e-2, 1e-3, 1e-4, 1e-5};
+    for (int k = 0; k < 5; k++) {
+        for (int flat = 0; flat < 2; flat++) {
+            test_shape shape = shape_make(SHAPE_BOX, flat ? 0.6 : 0.5 * thin[k], 0.5, flat ? 0.5 * thin[k] : 0.6, 0);
+            dist_field field = shape_field(&shape, 1, 1);
+            CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, NULL, &picture_a), ctx);
+            verdict v = judge(&shape, &camera, 1, 1, fmin(1e-5, 0.1 * thin[k]), &picture_a);
+            int good = CHECK_EQUAL(0, v.missed) & CHECK_EQUAL(0, v.spent) & CHECK_EQUAL(0, v.phantom) &
+                       CHECK(v.broken * 1000 <= v.judged);
+            if (!good || test_state.verbose)
+                printf("    %g thick: crossing %d, missed %d, phantom %d, outline %d, judged %d, broken %d, worst %.1e\n", thin[k],
+                       v.crossing, v.missed, v.phantom, v.outline, v.judged, v.broken, v.worst);
+        }
+    }
+    dist_context_destroy(ctx);
+}
+
+TEST(no_plate_is_missed_silently_at_any_angle)
+{
+    dist_context *ctx = shape_context();
+    const double thin[5] = {1e-2, 1e-3, 1e-4, 3e-5, 1e-5};
+    const int degrees[11] = {90, 60, 30, 20, 17, 14, 10, 7, 4, 2, 1};
+    for (int a = 0; a < 11; a++) {
+        for (int k = 0; k < 5; k++) {
+            test_random r = test_random_seed(4);
+            test_shape plate = shape_make(SHAPE_PAIR, thin[k], 10, 0, 0);
+            dist_field field = shape_field(&plate, 1, 1);
+            float o[3 * 200], d[3 * 200];
+            dist_hit hits[200];
+            double angle = degrees[a] * 3.14159265358979323846 / 180;
+            int missed = 0, spent = 0;
+            for (size_t j = 0; j < 200; j++) {
+                double turn = test_random_double(&r, 0, 6.28), away = test_random_double(&r, 1, 2);
+                d[3 * j] = (float)(cos(angle) * cos(turn));
+                d[3 * j + 1] = (float)(cos(angle) * sin(turn));
+                d[3 * j + 2] = (float)-sin(angle);
+                for (size_t i = 0; i < 3; i++)
+                    o[3 * j + i] = (float)((i < 2 ? test_random_double(&r, -0.3, 0.3) : 0) - away * (double)d[3 * j + i]);
+            }
+            CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, 200, o, d, NULL, hits, NULL), ctx);
+            for (int j = 0; j < 200; j++) {
+                missed += hits[j].status != DIST_RAY_HIT && hits[j].status != DIST_RAY_UNRESOLVED;
+                spent += hits[j].status == DIST_RAY_UNRESOLVED;
+            }
+            if (!CHECK_EQUAL(0, missed) || (test_state.verbose && spent))
+                printf("    %g thick at %d degrees: %d of 200 missed, %d unresolved\n", thin[k], degrees[a], missed, spent);
+            if (degrees[a] >= 4) CHECK_EQUAL(0, spent);
+        }
+    }
+    dist_context_destroy(ctx);
+}
+
+TEST(no_rod_thinner_than_a_pixel_is_missed)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(side(), side());
+    const double radius[3] = {5e-3, 1e-3, 1e-4}; /* a pixel is 0.017 wide there */
+    for (int k = 0; k < 3; k++) {
+        test_shape shape = shape_make(SHAPE_RODS, radius[k], 0, 0, 0);
+        dist_field field = shape_field(&shape, 1, 1);
+        CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, NULL, &picture_a), ctx);
+        verdict v = judge(&shape, &camera, 1, 1, 1e-5, &picture_a);
+        int good = CHECK_EQUAL(0, v.missed) & CHECK_EQUAL(0, v.spent) & CHECK_EQUAL(0, v.phantom) & CHECK(v.crossing > 0 || side() < SIDE);
+        if (!good || test_state.verbose)
+            printf("    %g thin: crossing %d, missed %d, phantom %d, outline %d, queries %llu\n", radius[k], v.crossing, v.missed,
+                   v.phantom, v.outline, picture_a.stats.queries);
+    }
+    dist_context_destroy(ctx);
+}
+
+TEST(cones_change_no_pixel)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(side(), side());
+    dist_render_desc how = plain_how();
+    how.no_cones = 1;
+    shape_case cases[CASES + 2];
+    shape_cases(cases);
+    cases[CASES] = cases[0];
+    cases[CASES].name = "rods";
+    cases[CASES].shape = shape_make(SHAPE_RODS, 1e-3, 0, 0, 0);
+    cases[CASES + 1] = cases[0];
+    cases[CASES + 1].name = "plate";
+    cases[CASES + 1].shape = shape_make(SHAPE_BOX, 0.6, 0.5, 5e-5, 0);
+    for (int k = 0; k < CASES + 2; k++) {
+        dist_field field = shape_field(&cases[k].shape, cases[k].radius, cases[k].lipschitz);
+        CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, NULL, &picture_a), ctx);
+        CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, &how, &picture_b), ctx);
+        int masks = 0, off = 0, touching = 0;
+        for (int i = 0; i < side() * side(); i++) {
+            double o[3], d[3], t0 = 0, t1 = 0;
+            shape_pixel(&camera, i % side(), i / side(), o, d);
+            int differs = picture_a.mask[i] != picture_b.mask[i];
+            double far = fabs((double)picture_a.distance[i] - (double)picture_b.distance[i]);
+            double bound = (double)picture_a.error[i] + (double)picture_b.error[i] + 2e-6;
+            if (!differs && !(picture_a.mask[i] && far > bound)) continue;
+            shape_enter(o, d, 1, &t0, &t1);
+            shape_crossing c = shape_cross(&cases[k].shape, o, d, t0, t1, cases[k].exact, 1e-5, 1e-4);
+            if (c.touched || (!c.crosses && c.least < 1e-4) || (c.crosses && c.below < 2e-6)) touching++;
+            else if (differs) masks++;
+            else off++;
+        }
+        int good = CHECK_EQUAL(0, masks) & CHECK_EQUAL(0, off) & CHECK(touching <= 10);
+        CHECK(picture_b.stats.cone_queries == 0);
+        if (!good || test_state.verbose)
+            printf("    %s: masks %d, distances %d, rays that touch %d; queries %llu with, %llu without\n", cases[k].name, masks, off,
+                   touching, picture_a.stats.queries, picture_b.stats.queries);
+    }
+    dist_context_destroy(ctx);
+}
+
+/* ---- single rays -------------------------------------------------------------------------------------------------- */
+
+/* Traces one ray against a shape; notes gets its queries unless NULL. */
+static dist_hit trace_one(dist_context *ctx, test_shape *shape, double radius, double lipschitz, const float o[3], const float d[3],
+                          const dist_render_desc *how, float *notes)
+{
+    dist_hit hit;
+    memset(&hit, 0, sizeof hit);
+    shape->queries = 0;
+    shape->notes = notes;
+    dist_field field = shape_field(shape, radius, lipschitz);
+    CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, 1, o, d, how, &hit, NULL), ctx);
+    return hit;
+}
+
+static float notes[4 * SHAPE_NOTES];
+
+/* 1 */
+TEST(grazing_rays_hit_within_the_bound_or_say_that_they_are_unresolved)
+{
+    dist_context *ctx = shape_context();
+    const double degrees[12] = {90, 60, 30, 20, 10, 5, 3, 2, 1, 0.5, 0.2, 0.1};
+    long most = 0;
+    for (int k = 0; k < 12; k++) {
+        for (int j = 0; j < 8; j++) {
+            double angle = degrees[k] * 3.14159265358979323846 / 180, tilt = 0.3 * j;
+            double n[3] = {0.36 * cos(tilt) + 0.48 * sin(tilt), 0.48 * cos(tilt) - 0.36 * sin(tilt), 0.8};
+            double length = shape_length(n[0], n[1], n[2]);
+            for (int i = 0; i < 3; i++) n[i] /= length;
+            double u[3] = {n[1], -n[0], 0};
+            length = shape_length(u[0], u[1], u[2]);
+            test_shape plane = shape_make(SHAPE_PLANE, n[0], n[1], n[2], 0);
+            float o[3], d[3];
+            for (int i = 0; i < 3; i++) {
+                double along = cos(angle) * u[i] / length - sin(angle) * n[i];
+                d[i] = (float)along;
+                o[i] = (float)(0.003 * j * u[i] - 1.5 * along); /* it meets the plane near 0 */
+            }
+            dist_hit hit = trace_one(ctx, &plane, 1, 1, o, d, NULL, NULL);
+            most = plane.queries > most ? plane.queries : most;
+            double from = n[0] * (double)o[0] + n[1] * (double)o[1] + n[2] * (double)o[2];
+            double by = n[0] * (double)d[0] + n[1] * (double)d[1] + n[2] * (double)d[2];
+            double size = shape_length((double)d[0], (double)d[1], (double)d[2]), expected = -from / by * size;
+            CHECK(hit.status == DIST_RAY_HIT || hit.status == DIST_RAY_UNRESOLVED);
+            if (degrees[k] >= 3) CHECK_EQUAL(DIST_RAY_HIT, hit.status);
+            if (hit.status == DIST_RAY_HIT) CHECK_NEAR(expected, hit.distance, (double)hit.error + 1e-6 + 2e-7 / sin(angle));
+            else CHECK(fabs((double)hit.sdf) < 1e-2);
+        }
+        if (degrees[k] >= 10) CHECK(most <= 33); /* the paper's rule at alpha 1.5 */
+    }
+    dist_context_destroy(ctx);
+}
+
+static long queries_after_crossing(const test_shape *shape)
+{
+    long at = 0;
+    while (at < shape->queries && notes[4 * at + 3] > 0) at++;
+    return at < shape->queries ? shape->queries - at - 1 : -1;
+}
+
+/* 2: the Lipschitz figure is wrong for all of these, so that the surface is crossed. Without a clamp it is half the truth,
+   or the first step would leave the sphere. */
+TEST(twelve_queries_finish_a_ray_once_it_has_crossed)
+{
+    dist_context *ctx = shape_context();
+    const double slopes[6] = {1.2, 1.33, 2, 5, 100, 1000};
+    long most = 0;
+    int crossed = 0, over = 0, rays = test_quick() ? 200 : 1000;
+    for (int k = 0; k < 6; k++) {
+        for (int kind = 0; kind < 6; kind++) {
+            test_random r = test_random_seed(3);
+            test_shape shape = kind < 2   ? shape_make(SHAPE_SPHERE, 0.7, 0, 0, 0)
+                               : kind < 4 ? shape_make(SHAPE_BOX, 0.5, 0.4, 0.45, 0)
+                                          : shape_make(SHAPE_TORUS, 0.6, 0.2, 0, 0);
+            int worse = 0;
+            shape.slope = slopes[k];
+            shape.clamp = kind % 2 ? 0.1 : 0;
+            for (int j = 0; j < rays; j++) {
+                float o[3], d[3];
+                test_random_direction(&r, o);
+                for (int i = 0; i < 3; i++) {
+                    o[i] *= 2.0f;
+                    d[i] = test_random_float(&r, -0.7f, 0.7f) - o[i];
+                }
+                dist_hit hit = trace_one(ctx, &shape, 1, shape.clamp > 0 ? 1 : fmax(1, 0.5 * slopes[k]), o, d, NULL, notes);
+                long after = queries_after_crossing(&shape);
+                if (after < 0) continue;
+                crossed++;
+                worse += after > 12;
+                most = after > most ? after : most;
+                CHECK_EQUAL(DIST_RAY_HIT, hit.status);
+                double p[3], length = shape_length((double)d[0], (double)d[1], (double)d[2]);
+                for (int i = 0; i < 3; i++) p[i] = (double)o[i] + (double)hit.distance * (double)d[i] / length;
+                CHECK_NEAR(0, shape_exact(&shape, p), (double)hit.error + 2e-6);
+            }
+            over += worse;
+            if (worse) printf("    slope %g%s, kind %d: %d of %d rays over\n", slopes[k], kind % 2 ? ", clamped" : "", kind / 2, worse, rays);
+        }
+    }
+    CHECK(crossed > rays * 12);
+    CHECK(most <= 20);
+    CHECK_EQUAL(0, over);
+    if (test_state.verbose || over) printf("    at most %ld queries after the crossing, %d of %d rays over 12\n", most, over, crossed);
+    dist_context_destroy(ctx);
+}
+
+/* 3 */
+TEST(small_slopes_finish_or_report_with_an_honest_bound)
+{
+    dist_context *ctx = shape_context();
+    const double slopes[4] = {0.3, 0.1, 0.05, 0.01};
+    for (int k = 0; k < 4; k++) {
+        int hits = 0;
+        for (int j = 0; j < 40; j++) {
+            test_shape shape = shape_make(SHAPE_SPHERE, 0.6, 0, 0, 0);
+            shape.slope = slopes[k];
+            float o[3] = {0, 0, 2.5f}, d[3] = {0.005f * (float)j, 0, -1};
+            dist_hit hit = trace_one(ctx, &shape, 1, 1, o, d, NULL, NULL);
+            double length = shape_length((double)d[0], 0, 1), along = 2.5 / length, off = 2.5 * (double)d[0] / length;
+            double expected = along - sqrt(0.36 - off * off);
+            hits += hit.status == DIST_RAY_HIT;
+            CHECK(hit.status == DIST_RAY_HIT || hit.status == DIST_RAY_UNRESOLVED);
+            if (hit.status == DIST_RAY_HIT) CHECK_NEAR(expected, hit.distance, (double)hit.error + 2e-6 + 1e-7 / slopes[k]);
+            else CHECK((double)hit.sdf > 0);
+        }
+        if (test_state.verbose) printf("    slope %g: %d of 40 hit\n", slopes[k], hits);
+        if (slopes[k] >= 0.05) CHECK_EQUAL(40, hits);
+    }
+    dist_context_destroy(ctx);
+}
+
+/* 4, 20 */
+TEST(constant_fields_end_within_the_budget_with_the_right_status)
+{
+    dist_context *ctx = shape_context();
+    const double values[8] = {1, 0.3, 1e-2, 1e-3, 2.5e-5, 0, -0.3, -2.5e-5};
+    const int expected[8] = {DIST_RAY_MISS, DIST_RAY_MISS, -1, -1, DIST_RAY_PLATEAU, DIST_RAY_PLATEAU, DIST_RAY_INSIDE,
+                             DIST_RAY_INSIDE};
+    for (int k = 0; k < 8; k++) {
+        test_shape shape = shape_make(SHAPE_CONSTANT, values[k], 0, 0, 0);
+        float o[3] = {0.1f, 0.2f, 2.5f}, d[3] = {0, 0, -1};
+        dist_hit hit = trace_one(ctx, &shape, 1, 1, o, d, NULL, NULL);
+        CHECK(shape.queries <= 100);
+        if (expected[k] >= 0) CHECK_EQUAL(expected[k], hit.status);
+        else CHECK(hit.status == DIST_RAY_MISS || hit.status == DIST_RAY_UNRESOLVED || hit.status == DIST_RAY_PLATEAU);
+        CHECK(test_finite((double)hit.distance));
+        CHECK_NEAR(values[k], hit.sdf, 1e-7);
+    }
+    dist_context_destroy(ctx);
+}
+
+/* 6: f = 1 to the last bit nearly everywhere. */
+TEST(a_saturated_tanh_is_traced_to_its_surface)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(32, 32);
+    test_shape shape = shape_make(SHAPE_SPHERE, 0.7, 0, 0, 0);
+    shape.squash = 200;
+    dist_field field = shape_field(&shape, 1, 20); /* a tenth of the true slope, which is nowhere but at the surface */
+    CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, NULL, &picture_a), ctx);
+    verdict v = judge(&shape, &camera, 1, 1, 1e-5, &picture_a);
+    CHECK_EQUAL(0, v.missed);
+    CHECK_EQUAL(0, v.phantom);
+    CHECK_EQUAL(0, v.broken);
+    dist_context_destroy(ctx);
+}
+
+/* 7 */
+TEST(a_camera_inside_the_sphere_starts_at_itself_and_ends_at_the_exit)
+{
+    dist_context *ctx = shape_context();
+    test_random r = test_random_seed(3);
+    for (int k = 0; k < 200; k++) {
+        test_shape shape = shape_make(SHAPE_TORUS, 0.6, 0.2, 0, 0);
+        float o[3] = {0, test_random_float(&r, 0.25f, 0.7f), 0}, d[3];
+        test_random_direction(&r, d);
+        dist_hit hit = trace_one(ctx, &shape, 1, 1, o, d, NULL, notes);
+        double from[3], v[3], t0, t1, length = shape_length((double)d[0], (double)d[1], (double)d[2]);
+        for (int i = 0; i < 3; i++) {
+            from[i] = (double)o[i];
+            v[i] = (double)d[i] / length;
+        }
+        CHECK(shape_enter(from, v, 1, &t0, &t1));
+        CHECK_NEAR(0, t0, 0);
+        for (long i = 0; i < shape.queries; i++) {
+            double t = 0;
+            for (int j = 0; j < 3; j++) t += ((double)notes[4 * i + j] - from[j]) * v[j];
+            CHECK(t > -1e-6 && t < t1 + 1e-6);
+            if (i == 0) CHECK_NEAR(0, t, 1e-6);
+        }
+        shape_crossing c = shape_cross(&shape, from, v, t0, t1, 1, 1e-5, 1e-4);
+        if (c.touched || (c.crosses && c.below < 1e-6) || (!c.crosses && c.least < 1e-4)) continue;
+        CHECK_EQUAL(c.crosses ? DIST_RAY_HIT : DIST_RAY_MISS, hit.status);
+        if (c.crosses) CHECK_NEAR(c.t, hit.distance, (double)hit.error + 1e-6);
+    }
+    dist_context_destroy(ctx);
+}
+
+/* 8 */
+TEST(a_camera_inside_the_solid_gets_what_the_desc_says)
+{
+    dist_context *ctx = shape_context();
+    test_shape shape = shape_make(SHAPE_SPHERE, 0.7, 0, 0, 0);
+    test_random r = test_random_seed(4);
+    for (int k = 0; k < 100; k++) {
+        float o[3], d[3];
+        test_random_fill(&r, 3, o, -0.39f, 0.39f);
+        test_random_direction(&r, d);
+        dist_render_desc how = plain_how();
+        how.inside = DIST_INSIDE_BACKGROUND;
+        dist_hit hit = trace_one(ctx, &shape, 1, 1, o, d, &how, NULL);
+        CHECK_EQUAL(DIST_RAY_INSIDE, hit.status);
+        CHECK_EQUAL(1, shape.queries);
+        how.inside = DIST_INSIDE_HIT;
+        hit = trace_one(ctx, &shape, 1, 1, o, d, &how, NULL);
+        CHECK_EQUAL(DIST_RAY_INSIDE, hit.status);
+        CHECK_NEAR(0, hit.distance, 1e-7);
+        how.inside = DIST_INSIDE_EXIT;
+        hit = trace_one(ctx, &shape, 1, 1, o, d, &how, NULL);
+        CHECK_EQUAL(DIST_RAY_HIT, hit.status);
+        double along = 0, square = 0, length = shape_length((double)d[0], (double)d[1], (double)d[2]);
+        for (int i = 0; i < 3; i++) {
+            along += (double)o[i] * (double)d[i] / length;
+            square += (double)o[i] * (double)o[i];
+        }
+        CHECK_NEAR(-along + sqrt(along * along - square + 0.49), hit.distance, (double)hit.error + 1e-6);
+    }
+    dist_context_destroy(ctx);
+}
+
+/* 9 */
+TEST(a_ray_that_starts_on_the_surface_leaves_it)
+{
+    dist_context *ctx = shape_context();
+    test_random r = test_random_seed(5);
+    int stuck = 0, wrong = 0;
+    for (int k = 0; k < 300; k++) {
+        test_shape shape = shape_make(SHAPE_SPHERE, 0.5, 0, 0, 0);
+        float n[3], d[3], o[3];
+        test_random_direction(&r, n);
+        test_random_direction(&r, d);
+        double away = 0;
+        for (int i = 0; i < 3; i++) away += (double)n[i] * (double)d[i];
+        for (int i = 0; i < 3; i++) {
+            o[i] = 0.500001f * n[i]; /* just outside, whatever rounding does */
+            if (away < 0) d[i] = -d[i];
+        }
+        if (fabs(away) < 0.05) continue;
+        dist_hit hit = trace_one(ctx, &shape, 1, 1, o, d, NULL, NULL);
+        stuck += shape.queries > 60;
+        wrong += hit.status != DIST_RAY_MISS;
+        for (int i = 0; i < 3; i++) d[i] = -d[i];
+        hit = trace_one(ctx, &shape, 1, 1, o, d, NULL, NULL);
+        wrong += hit.status != DIST_RAY_HIT || fabs((double)hit.distance) > 1e-4;
+    }
+    CHECK_EQUAL(0, stuck);
+    CHECK_EQUAL(0, wrong);
+    test_shape shape = shape_make(SHAPE_SPHERE, 0.5, 0, 0, 0);
+    const float exact[3] = {0, 0, 0.5f}, up[3] = {0, 0, 1}, down[3] = {0, 0, -1}, along[3] = {1, 0, 0};
+    CHECK_EQUAL(DIST_RAY_MISS, trace_one(ctx, &shape, 1, 1, exact, up, NULL, NULL).status);
+    CHECK_EQUAL(DIST_RAY_MISS, trace_one(ctx, &shape, 1, 1, exact, along, NULL, NULL).status);
+    CHECK(shape.queries <= 60);
+    CHECK_NEAR(0, trace_one(ctx, &shape, 1, 1, exact, down, NULL, NULL).distance, 1e-4);
+    dist_context_destroy(ctx);
+}
+
+TEST(the_bounding_sphere_itself_is_no_obstacle)
+{
+    dist_context *ctx = shape_context();
+    test_shape shape = shape_make(SHAPE_SPHERE, 0.5, 0, 0, 0);
+    const float on[3] = {0, 0, 1}, in[3] = {0, 0, -1}, out[3] = {0, 0, 1}, along[3] = {1, 0, 0}, off[3] = {-3, 0, 1};
+    dist_hit hit = trace_one(ctx, &shape, 1, 1, on, in, NULL, NULL);
+    CHECK_EQUAL(DIST_RAY_HIT, hit.status);
+    CHECK_NEAR(0.5, hit.distance, (double)hit.error + 1e-6);
+    CHECK_EQUAL(DIST_RAY_MISS, trace_one(ctx, &shape, 1, 1, on, out, NULL, NULL).status);
+    CHECK_EQUAL(0, shape.queries);
+    CHECK_EQUAL(DIST_RAY_MISS, trace_one(ctx, &shape, 1, 1, on, along, NULL, NULL).status);
+    CHECK(shape.queries <= 1);
+    CHECK_EQUAL(DIST_RAY_MISS, trace_one(ctx, &shape, 1, 1, off, along, NULL, NULL).status); /* a tangent */
+    CHECK(shape.queries <= 1);
+    dist_context_destroy(ctx);
+}
+
+/* 10 */
+TEST(an_object_behind_costs_no_query)
+{
+    dist_context *ctx = shape_context();
+    test_shape shape = shape_make(SHAPE_SPHERE, 0.5, 0, 0, 0);
+    const float o[3] = {0.1f, 0, 2}, d[3] = {0, 0.1f, 1};
+    CHECK_EQUAL(DIST_RAY_MISS, trace_one(ctx, &shape, 1, 1, o, d, NULL, NULL).status);
+    CHECK_EQUAL(0, shape.queries);
+    dist_context_destroy(ctx);
+}
+
+/* 11 */
+TEST(far_origins_hit_what_double_hits)
+{
+    dist_context *ctx = shape_context();
+    const double away[5] = {1, 1e2, 1e4, 1e6, 1e12};
+    for (int k = 0; k < 5; k++) {
+        test_random r = test_random_seed(6);
+        int hits = 0;
+        for (int j = 0; j < 400; j++) {
+            test_shape shape = shape_make(SHAPE_SPHERE, 0.7, 0, 0, 0);
+            float u[3], o[3], d[3];
+            double from[3], v[3], length = 0, along = 0, square = 0;
+            test_random_direction(&r, u);
+            for (int i = 0; i < 3; i++) {
+                o[i] = (float)(away[k] * (double)u[i] * 1.5);
+                d[i] = (float)(-(double)o[i] + test_random_double(&r, -0.6, 0.6));
+                from[i] = (double)o[i];
+                v[i] = (double)d[i];
+                length += v[i] * v[i];
+            }
+            for (int i = 0; i < 3; i++) along -= from[i] * v[i] / sqrt(length);
+            for (int i = 0; i < 3; i++) {
+                double q = from[i] + along * v[i] / sqrt(length);
+                square += q * q;
+            }
+            dist_hit hit = trace_one(ctx, &shape, 1, 1, o, d, NULL, NULL);
+            double off = sqrt(square);
+            if (fabs(off - 0.7) < 1e-4 + 1e-14 * away[k]) continue; /* the outline */
+            CHECK_EQUAL(off < 0.7 ? DIST_RAY_HIT : DIST_RAY_MISS, hit.status);
+            if (off > 0.7 || hit.status != DIST_RAY_HIT) continue;
+            hits++;
+            double expected = along - sqrt(0.49 - square), grazing = sqrt(0.49 - square) / 0.7;
+            CHECK_NEAR(expected, hit.distance, (double)hit.error + (2e-6 + 1e-14 * away[k]) / fmax(grazing, 0.05) + 6e-8 * expected);
+            CHECK((double)hit.error < 1e-4 / fmax(grazing, 1e-2));
+        }
+        CHECK(hits > 50 || away[k] > 1e7);
+    }
+    dist_context_destroy(ctx);
+}
+
+/* 14 */
+TEST(no_epsilon_is_too_small)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(64, 64);
+    const float epsilons[5] = {0, 1e-30f, 1e-12f, 5e-8f, 1e-6f};
+    for (int k = 0; k < 5; k++) {
+        test_shape shape = shape_make(SHAPE_TORUS, 0.6, 0.2, 0, 0);
+        dist_field field = shape_field(&shape, 1, 1);
+        dist_render_desc how = plain_how();
+        how.epsilon = epsilons[k];
+        CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, &how, &picture_a), ctx);
+        verdict v = judge(&shape, &camera, 1, 1, 1e-5, &picture_a);
+        CHECK_EQUAL(0, v.missed);
+        CHECK_EQUAL(0, v.phantom);
+        CHECK(picture_a.stats.epsilon >= 1e-7f && picture_a.stats.epsilon >= epsilons[k] && picture_a.stats.epsilon <= 1e-4f);
+        CHECK(picture_a.stats.queries < 64 * 64 * 20);
+        if (k > 0 && k < 4) CHECK(v.broken * 1000 <= v.judged);
+    }
+    dist_context_destroy(ctx);
+}
+
+/* 15 */
+TEST(a_large_epsilon_dilates_by_no_more_than_itself)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(64, 64);
+    test_shape shape = shape_make(SHAPE_SPHERE, 0.5, 0, 0, 0);
+    dist_field field = shape_field(&shape, 1, 1);
+    dist_render_desc how = plain_how();
+    how.epsilon = 5e-2f;
+    CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, &how, &picture_a), ctx);
+    for (int i = 0; i < 64 * 64; i++) {
+        double o[3], d[3], along = 0;
+        shape_pixel(&camera, i % 64, i / 64, o, d);
+        for (int k = 0; k < 3; k++) along -= o[k] * d[k];
+        double off = shape_length(o[0] + along * d[0], o[1] + along * d[1], o[2] + along * d[2]);
+        if (off < 0.4999) CHECK_EQUAL(1, picture_a.mask[i]);
+        if (off > 0.5501) CHECK_EQUAL(0, picture_a.mask[i]);
+    }
+    dist_context_destroy(ctx);
+}
+
+/* 16 */
+TEST(every_step_scale_converges_and_the_others_are_refused)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(64, 64);
+    const float good[7] = {0.5f, 1, 1.5f, 1.99f, 2, 2.5f, 10};
+    test_shape shape = shape_make(SHAPE_TORUS, 0.6, 0.2, 0, 0);
+    dist_field field = shape_field(&shape, 1, 1);
+    dist_render_desc how = plain_how();
+    for (int k = 0; k < 7; k++) {
+        for (int cones = 0; cones < 2; cones++) {
+            how.step_scale = good[k];
+            how.no_cones = cones;
+            CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, &how, &picture_a), ctx);
+            verdict v = judge(&shape, &camera, 1, 1, 1e-5, &picture_a);
+            CHECK_EQUAL(0, v.missed);
+            CHECK_EQUAL(0, v.phantom);
+            CHECK(v.broken * 1000 <= v.judged);
+        }
+    }
+    uint32_t infinite = 0x7f800000u;
+    float bad[4] = {-1, -1e-30f, test_nan(), 0};
+    memcpy(bad + 3, &infinite, sizeof infinite);
+    for (int k = 0; k < 4; k++) {
+        dist_context_clear(ctx);
+        how.step_scale = bad[k];
+        CHECK_STATUS(DIST_BAD_ARGUMENT, picture_render(ctx, &field, &camera, &how, &picture_a), ctx);
+        CHECK_TEXT("step_scale", dist_context_message(ctx));
+    }
+    dist_context_destroy(ctx);
+}
+
+/* 18 */
+TEST(the_nearest_of_two_surfaces_is_hit)
+{
+    dist_context *ctx = shape_context();
+    const double thick[6] = {1e-1, 1e-3, 1e-5, 1e-6, 2.4e-7, 6e-8};
+    const double gaps[4] = {0.1, 1e-3, 1e-5, 6e-8};
+    for (int k = 0; k < 6; k++) {
+        for (int g = 0; g < 4; g++) {
+            for (int j = 0; j < 20; j++) {
+                test_shape pair = shape_make(SHAPE_PAIR, thick[k], gaps[g], 0, 0);
+                float d[3] = {0.02f * (float)j, -0.03f, -1};
+                float o[3] = {0.05f * (float)j - 0.5f - 2 * d[0], 0.1f - 2 * d[1], 2.0f + 0.013f * (float)j};
+                dist_hit hit = trace_one(ctx, &pair, 1, 1, o, d, NULL, NULL);
+                double length = shape_length((double)d[0], (double)d[1], 1);
+                CHECK_EQUAL(DIST_RAY_HIT, hit.status);
+                /* where a plate is thinner than epsilon the hit may be anywhere within epsilon of it */
+                if (!CHECK_NEAR((double)o[2] * length, hit.distance,
+                                (double)hit.error + 2e-6 + (thick[k] < 1e-4 ? 5.1e-5 * length : 0)))
+                    printf("    %g thick, %g apart, ray %d\n", thick[k], gaps[g], j);
+            }
+        }
+    }
+    for (int j = 0; j < 20; j++) {
+        test_shape shells = shape_make(SHAPE_SHELLS, 1e-4, 0, 0, 0);
+        float o[3] = {0, 0, 2}, d[3] = {0.017f * (float)j, 0, -1};
+        dist_hit hit = trace_one(ctx, &shells, 1, 1, o, d, NULL, NULL);
+        double size = shape_length((double)d[0], 0, 1), off = 2 * (double)d[0] / size, outer = 0.7 + 5e-5;
+        CHECK_EQUAL(DIST_RAY_HIT, hit.status);
+        CHECK_NEAR(2 / size - sqrt(outer * outer - off * off), hit.distance, (double)hit.error + 2e-6);
+    }
+    dist_context_destroy(ctx);
+}
+
+/* 19: slope up to 9 with a figure of 1: crossings may be jumped, but what is called a hit is one. */
+TEST(bumps_too_steep_for_the_figure_are_hit_at_a_crossing_and_end)
+{
+    dist_context *ctx = shape_context();
+    test_shape shape = shape_make(SHAPE_BUMPY, 0.6, 0.1, 80, 0);
+    dist_camera camera = shape_camera(64, 64);
+    dist_field field = shape_field(&shape, 1, 1);
+    CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, NULL, &picture_a), ctx);
+    int hits = 0, far = 0, unresolved = 0;
+    for (int i = 0; i < 64 * 64; i++) {
+        double o[3], d[3];
+        shape_pixel(&camera, i % 64, i / 64, o, d);
+        unresolved += picture_a.status[i] == DIST_RAY_UNRESOLVED;
+        if (!picture_a.mask[i]) continue;
+        hits++;
+        double t = (double)picture_a.distance[i], e = (double)picture_a.error[i] + 1e-6;
+        double a = shape_along(&shape, o, d, t - e), b = shape_along(&shape, o, d, t + e);
+        far += !(a * b <= 0 || fabs(shape_along(&shape, o, d, t)) < 6e-5);
+    }
+    CHECK(hits > 500);
+    CHECK(far * 1000 <= hits);
+    if (test_state.verbose) printf("    %d hits, %d of them at no crossing, %d unresolved\n", hits, far, unresolved);
+    CHECK(picture_a.stats.queries < 64 * 64 * 40);
+    dist_context_destroy(ctx);
+}
+
+/* 22 */
+TEST(nan_from_the_field_is_not_finite_and_no_hit)
+{
+    dist_context *ctx = shape_context();
+    test_shape shape = shape_make(SHAPE_SPHERE, 0.5, 0, 0, 0);
+    shape.poison = 0.2;
+    dist_field field = shape_field(&shape, 1, 1);
+    dist_render_desc how = plain_how();
+    for (int cones = 0; cones < 2; cones++) {
+        float o[3 * 50], d[3 * 50];
+        dist_hit hits[50];
+        dist_stats stats;
+        for (size_t j = 0; j < 50; j++) {
+            o[3 * j] = 0.8f * ((float)j / 50.0f - 0.5f);
+            o[3 * j + 1] = 0;
+            o[3 * j + 2] = 2;
+            d[3 * j] = d[3 * j + 1] = 0;
+            d[3 * j + 2] = -1;
+        }
+        how.no_cones = cones;
+        CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, 50, o, d, &how, hits, &stats), ctx);
+        unsigned long long bad = 0;
+        for (size_t j = 0; j < 50; j++) {
+            double x = fabs((double)o[3 * j]);
+            CHECK(test_finite((double)hits[j].distance) && test_finite((double)hits[j].error) && test_finite((double)hits[j].sdf));
+            if (x > 0.201) CHECK_EQUAL(DIST_RAY_HIT, hits[j].status);
+            if (x < 0.15) CHECK_EQUAL(DIST_RAY_NOT_FINITE, hits[j].status);
+            bad += hits[j].status == DIST_RAY_NOT_FINITE;
+        }
+        CHECK(bad == stats.not_finite && bad > 10);
+    }
+    dist_context_destroy(ctx);
+}
+
+/* 31 */
+TEST(a_surface_without_slope_ends_within_the_budget)
+{
+    dist_context *ctx = shape_context();
+    int hits = 0;
+    for (int j = 0; j < 30; j++) {
+        test_shape shape = shape_make(SHAPE_SPHERE, 0.6, 0, 0, 0);
+        shape.power = 3;
+        float o[3] = {0.01f * (float)j, 0, 1.5f}, d[3] = {0, 0, -1};
+        dist_hit hit = trace_one(ctx, &shape, 1, 1, o, d, NULL, NULL);
+        double expected = 1.5 - sqrt(0.36 - (double)o[0] * (double)o[0]);
+        CHECK(shape.queries <= 140);
+        CHECK(hit.status == DIST_RAY_HIT || hit.status == DIST_RAY_UNRESOLVED || hit.status == DIST_RAY_PLATEAU);
+        hits += hit.status == DIST_RAY_HIT;
+        /* |f| / |df/dt| says too little at a triple root: epsilon is what holds there */
+        if (hit.status == DIST_RAY_HIT) CHECK_NEAR(expected, hit.distance, fmax((double)hit.error, 5e-5));
+    }
+    if (test_state.verbose) printf("    %d of 30 hit\n", hits);
+    dist_context_destroy(ctx);
+}
+
+/* 33 */
+TEST(equal_ends_of_a_bracket_fall_back_to_bisection)
+{
+    dist_context *ctx = shape_context();
+    for (int j = 0; j < 30; j++) {
+        test_shape shape = shape_make(SHAPE_SPHERE, 0.6, 0, 0, 0);
+        shape.power = -1; /* 0.01 outside, -0.01 inside, nothing between */
+        float o[3] = {0.01f * (float)j, 0, 1.2f}, d[3] = {0, 0, -1};
+        dist_hit hit = trace_one(ctx, &shape, 1, 1, o, d, NULL, NULL);
+        CHECK_EQUAL(DIST_RAY_HIT, hit.status);
+        CHECK_NEAR(1.2 - sqrt(0.36 - (double)o[0] * (double)o[0]), hit.distance, (double)hit.error + 1e-6);
+        CHECK(hit.error < 1e-4f);
+        CHECK(shape.queries <= 112);
+    }
+    dist_context_destroy(ctx);
+}
+
+/* ---- budgets, statuses, free rays ----------------------------------------------------------------------------------- */
+
+TEST(no_ray_asks_more_than_its_budget_and_twelve)
+{
+    dist_context *ctx = shape_context();
+    const int budgets[6] = {1, 2, 5, 12, 30, 100};
+    shape_case cases[CASES];
+    shape_cases(cases);
+    test_random r = test_random_seed(7);
+    long over = 0;
+    for (int k = 0; k < CASES; k++) {
+        for (int b = 0; b < 6; b++) {
+            for (int j = 0; j < 60; j++) {
+                float o[3], d[3];
+                test_random_direction(&r, o);
+                for (int i = 0; i < 3; i++) {
+                    o[i] *= 2.0f;
+                    d[i] = test_random_float(&r, -0.7f, 0.7f) - o[i];
+                }
+                dist_render_desc how = plain_how();
+                how.max_steps = budgets[b];
+                trace_one(ctx, &cases[k].shape, 1, cases[k].lipschitz, o, d, &how, NULL);
+                over = cases[k].shape.queries - budgets[b] > over ? cases[k].shape.queries - budgets[b] : over;
+            }
+        }
+    }
+    if (test_state.verbose) printf("    at most %ld over\n", over);
+    CHECK(over <= 12);
+    dist_context_destroy(ctx);
+}
+
+/* Each status against what the ray really meets; a spent budget gives the best of its samples. */
+TEST(statuses_are_truthful)
+{
+    dist_context *ctx = shape_context();
+    const int budgets[4] = {3, 6, 12, 100};
+    shape_case cases[CASES];
+    shape_cases(cases);
+    test_random r = test_random_seed(8);
+    int seen[6] = {0, 0, 0, 0, 0, 0}, wrong = 0;
+    for (int j = 0; j < 2000; j++) {
+        shape_case *c = &cases[j % CASES];
+        float o[3], d[3];
+        double from[3], v[3], t0, t1;
+        test_random_direction(&r, o);
+        for (int i = 0; i < 3; i++) {
+            o[i] *= j % 3 ? 2.0f : 0.9f;
+            d[i] = test_random_float(&r, -0.9f, 0.9f) - o[i];
+            from[i] = (double)o[i];
+            v[i] = (double)d[i];
+        }
+        double length = shape_length(v[0], v[1], v[2]);
+        for (int i = 0; i < 3; i++) v[i] /= length;
+        dist_render_desc how = plain_how();
+        how.max_steps = budgets[j % 4];
+        dist_hit hit = trace_one(ctx, &c->shape, 1, c->lipschitz, o, d, &how, notes);
+        if (!CHECK(hit.status >= 0 && hit.status <= DIST_RAY_NOT_FINITE)) continue;
+        seen[hit.status]++;
+        CHECK(hit.status != DIST_RAY_NOT_FINITE);
+        if (!shape_enter(from, v, 1, &t0, &t1)) {
+            CHECK_EQUAL(DIST_RAY_MISS, hit.status);
+            continue;
+        }
+        shape_crossing x = shape_cross(&c->shape, from, v, t0, t1, c->exact, 1e-5, 1e-4);
+        if (hit.status == DIST_RAY_MISS) wrong += x.crosses && x.below > 2e-6;
+        if (hit.status == DIST_RAY_HIT) wrong += !x.crosses && x.least > 1.1e-4;
+        if (hit.status == DIST_RAY_INSIDE) wrong += !(shape_exact(&c->shape, from) < 0 || x.t - t0 < 1e-6);
+        double p[3];
+        for (int i = 0; i < 3; i++) p[i] = from[i] + (double)hit.distance * v[i];
+        double f = shape_value(&c->shape, p);
+        if (hit.status == DIST_RAY_HIT) CHECK_NEAR(f, hit.sdf, 1.1e-4);
+        if (hit.status != DIST_RAY_UNRESOLVED) continue;
+        double least = 1e30;
+        for (long i = 0; i < c->shape.queries; i++) least = fmin(least, fabs((double)notes[4 * i + 3]));
+        CHECK_NEAR(least, hit.sdf, 1e-9);
+        CHECK_NEAR(f, hit.sdf, 2e-6);
+    }
+    CHECK_EQUAL(0, wrong);
+    CHECK(seen[DIST_RAY_MISS] > 100 && seen[DIST_RAY_HIT] > 100 && seen[DIST_RAY_UNRESOLVED] > 20);
+    dist_context_destroy(ctx);
+}
+
+TEST(free_rays_take_directions_of_any_length)
+{
+    dist_context *ctx = shape_context();
+    const float lengths[6] = {1, 2e-38f, 1e-20f, 1e-6f, 1e6f, 1e38f};
+    for (int k = 0; k < 6; k++) {
+        test_shape shape = shape_make(SHAPE_SPHERE, 0.5, 0, 0, 0);
+        float o[3] = {0.1f, 0.2f, 2}, d[3] = {0, 0, -lengths[k]};
+        dist_hit hit = trace_one(ctx, &shape, 1, 1, o, d, NULL, NULL);
+        CHECK_EQUAL(DIST_RAY_HIT, hit.status);
+        CHECK_NEAR(2 - sqrt(0.25 - 0.05), hit.distance, (double)hit.error + 1e-6);
+    }
+    dist_context_destroy(ctx);
+}
+
+TEST(free_rays_without_a_direction_are_not_finite)
+{
+    dist_context *ctx = shape_context();
+    test_shape shape = shape_make(SHAPE_SPHERE, 0.5, 0, 0, 0);
+    uint32_t infinite = 0x7f800000u;
+    float inf;
+    memcpy(&inf, &infinite, sizeof inf);
+    const float o[5][3] = {{0, 0, 2}, {0, 0, 2}, {0, 0, 2}, {test_nan(), 0, 2}, {0, inf, 2}};
+    const float d[5][3] = {{0, 0, 0}, {0, test_nan(), -1}, {inf, 0, -1}, {0, 0, -1}, {0, 0, -1}};
+    for (int k = 0; k < 5; k++) {
+        dist_hit hit = trace_one(ctx, &shape, 1, 1, o[k], d[k], NULL, NULL);
+        CHECK_EQUAL(DIST_RAY_NOT_FINITE, hit.status);
+        CHECK_EQUAL(0, shape.queries);
+        CHECK(test_finite((double)hit.distance) && test_finite((double)hit.error) && test_finite((double)hit.sdf));
+    }
+    dist_context_destroy(ctx);
+}
+
+/* Many rays are the same as each by itself, and their counts are the sum. */
+TEST(many_free_rays_are_the_same_as_single_ones)
+{
+    enum { RAYS = 2500 };
+    static float o[3 * RAYS], d[3 * RAYS];
+    static dist_hit hits[RAYS];
+    dist_context *ctx = shape_context();
+    test_random r = test_random_seed(9);
+    unsigned long long queries = 0, counts[6] = {0, 0, 0, 0, 0, 0};
+    test_shape shape = shape_make(SHAPE_TORUS, 0.6, 0.2, 0, 0);
+    dist_field field = shape_field(&shape, 1, 1);
+    dist_stats stats;
+    test_random_fill(&r, 3 * RAYS, o, -1.5f, 1.5f);
+    test_random_fill(&r, 3 * RAYS, d, -1.0f, 1.0f);
+    CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, RAYS, o, d, NULL, hits, &stats), ctx);
+    for (int i = 0; i < RAYS; i++) {
+        dist_hit one = trace_one(ctx, &shape, 1, 1, o + 3 * i, d + 3 * i, NULL, NULL);
+        CHECK_BYTES(sizeof one, &one, &hits[i]);
+        queries += (unsigned long long)shape.queries;
+        counts[hits[i].status]++;
+    }
+    CHECK(stats.rays == RAYS && stats.queries == queries);
+    CHECK(stats.queries == stats.march_queries + stats.refine_queries && stats.cone_queries == 0);
+    CHECK(stats.hits == counts[DIST_RAY_HIT] && stats.inside == counts[DIST_RAY_INSIDE]);
+    CHECK(stats.unresolved == counts[DIST_RAY_UNRESOLVED] && stats.plateau == counts[DIST_RAY_PLATEAU]);
+    CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, 0, NULL, NULL, NULL, NULL, &stats), ctx);
+    CHECK(stats.rays == 0 && stats.queries == 0);
+    dist_context_destroy(ctx);
+}
+
+TEST(trace_refuses_what_it_cannot_trace)
+{
+    dist_context *ctx = shape_context();
+    test_shape shape = shape_make(SHAPE_SPHERE, 0.5, 0, 0, 0);
+    const float o[3] = {0, 0, 2}, d[3] = {0, 0, -1};
+    for (int k = 0; k < 18; k++) {
+        dist_field field = shape_field(&shape, 1, 1);
+        dist_render_desc how = plain_how();
+        const char *part = "field";
+        dist_hit hit;
+        int f = 1, origin = 1, direction = 1, result = 1;
+        if (k == 0) f = 0;
+        if (k == 1) origin = 0, part = "origins";
+        if (k == 2) direction = 0, part = "directions";
+        if (k == 3) result = 0, part = "hits";
+        if (k == 4) field.eval_fn = NULL;
+        if (k == 5) field.radius = 0, part = "radius";
+        if (k == 6) field.radius = test_nan(), part = "radius";
+        if (k == 7) field.center[1] = test_nan(), part = "center";
+        if (k == 8) field.lipschitz = -1, part = "lipschitz";
+        if (k == 9) field.clamp = test_nan(), part = "clamp";
+        if (k == 10) how.max_steps = -1, part = "max_steps";
+        if (k == 11) how.epsilon = -1e-3f, part = "epsilon";
+        if (k == 12) how.epsilon = test_nan(), part = "epsilon";
+        if (k == 13) how.inside = 3, part = "inside";
+        if (k == 14) how.lipschitz = test_nan(), part = "lipschitz";
+        if (k == 15) how.samples = 9, part = "samples";
+        if (k == 16) how.trace = 2, part = "trace";
+        if (k == 17) how.normal_delta = -1, part = "normal_delta";
+        dist_context_clear(ctx);
+        shape.queries = 0;
+        CHECK_STATUS(DIST_BAD_ARGUMENT,
+                     dist_trace(ctx, f ? &field : NULL, 1, origin ? o : NULL, direction ? d : NULL, &how, result ? &hit : NULL, NULL),
+                     ctx);
+        CHECK_TEXT("dist_trace: ", dist_context_message(ctx));
+        CHECK_TEXT(part, dist_context_message(ctx));
+        CHECK_EQUAL(0, shape.queries);
+    }
+    dist_context_destroy(ctx);
+}
+
+/* ---- the paper's tracer --------------------------------------------------------------------------------------------- */
+
+static dist_render_desc paper_how(int row, int steps)
+{
+    dist_render_desc how = plain_how();
+    how.trace = DIST_TRACE_PAPER;
+    how.paper_row = row;
+    how.max_steps = steps;
+    return how;
+}
+
+TEST(each_row_of_the_ladder_asks_less_than_the_one_before)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(SIDE, SIDE);
+    test_shape shape = shape_make(SHAPE_TORUS, 0.6, 0.2, 0, 0);
+    dist_field field = shape_field(&shape, 1, 1);
+    unsigned long long queries[4];
+    for (int row = 0; row < 4; row++) {
+        dist_render_desc how = paper_how(row, 50);
+        CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, &how, &picture_a), ctx);
+        queries[row] = picture_a.stats.queries;
+        verdict v = judge(&shape, &camera, 1, 1, 1e-5, &picture_a);
+        CHECK(v.missed * 50 <= v.crossing);
+        CHECK_EQUAL(0, v.phantom);
+        if (test_state.verbose)
+            printf("    row %d: %llu queries, %d of %d missed, %d unresolved, worst %.1e\n", row, queries[row], v.missed, v.crossing,
+                   v.unresolved, v.worst);
+    }
+    CHECK(queries[DIST_PAPER_PARALLEL] > queries[DIST_PAPER_DYNAMIC]);
+    CHECK(queries[DIST_PAPER_DYNAMIC] > queries[DIST_PAPER_AGGRESSIVE]);
+    CHECK(queries[DIST_PAPER_AGGRESSIVE] > queries[DIST_PAPER_COARSE_TO_FINE]);
+    CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, NULL, &picture_a), ctx);
+    CHECK(queries[DIST_PAPER_COARSE_TO_FINE] > picture_a.stats.queries);
+    if (test_state.verbose) printf("    guarded: %llu queries\n", picture_a.stats.queries);
+    dist_context_destroy(ctx);
+}
+
+/* One pixel that looks along +z from 0. */
+static dist_camera pinhole(void)
+{
+    dist_camera camera;
+    memset(&camera, 0, sizeof camera);
+    camera.fx = camera.fy = 1;
+    camera.rotation[0] = camera.rotation[4] = camera.rotation[8] = 1;
+    camera.width = camera.height = 1;
+    return camera;
+}
+
+/* 1: d = 1, epsilon 5e-5, 10 degrees. The sphere is large, so that neither it nor the clamp matters. */
+TEST(the_paper_needs_52_steps_at_10_degrees_and_33_at_alpha_1_5)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = pinhole();
+    double angle = 10 * 3.14159265358979323846 / 180;
+    const int rows[2] = {DIST_PAPER_DYNAMIC, DIST_PAPER_AGGRESSIVE}, steps[2] = {52, 33};
+    for (int k = 0; k < 2; k++) {
+        test_shape plane = shape_make(SHAPE_PLANE, 0, cos(angle), -sin(angle), -1);
+        dist_field field = shape_field(&plane, 12, 1);
+        dist_render_desc how = paper_how(rows[k], 100);
+        how.epsilon = 5e-5f;
+        CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, &how, &picture_a), ctx);
+        CHECK_EQUAL(DIST_RAY_HIT, picture_a.status[0]);
+        CHECK_EQUAL(steps[k] + 1, plane.queries); /* the last query finds that the step before it was enough */
+        CHECK_NEAR(1 / sin(angle), picture_a.distance[0], 5e-5 / sin(angle));
+    }
+    dist_context_destroy(ctx);
+}
+
+/* 2: contracts while alpha * slope < 2. */
+TEST(the_paper_converges_up_to_slope_1_2_and_not_from_1_34_on)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = pinhole();
+    const double slopes[8] = {0.3, 0.6, 1, 1.2, 1.34, 1.5, 2, 5};
+    for (int k = 0; k < 8; k++) {
+        test_shape plane = shape_make(SHAPE_PLANE, 0, 0, -1, -0.7213);
+        plane.slope = slopes[k];
+        dist_field field = shape_field(&plane, 1, slopes[k]);
+        dist_render_desc how = paper_how(DIST_PAPER_AGGRESSIVE, 100);
+        CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, &how, &picture_a), ctx);
+        CHECK_EQUAL(slopes[k] < 1.3, picture_a.mask[0]);
+        if (slopes[k] > 1.3) CHECK_EQUAL(DIST_RAY_UNRESOLVED, picture_a.status[0]);
+        how = plain_how();
+        CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, &how, &picture_a), ctx);
+        CHECK_EQUAL(1, picture_a.mask[0]);
+        CHECK_NEAR(0.7213, picture_a.distance[0], (double)picture_a.error[0] + 1e-6);
+    }
+    dist_context_destroy(ctx);
+}
+
+/* ---- real decoders -------------------------------------------------------------------------------------------------- */
+
+static int order_doubles(const void *a, const void *b)
+{
+    double x = *(const double *)a, y = *(const double *)b;
+    return x < y ? -1 : x > y;
+}
+
+/* The middle of the reference picture, `size` pixels a side, rendered and compared. */
+static void compare_decoder(dist_context *ctx, const char *name, int size)
+{
+    static double off[PIXELS];
+    char base[64], file[96];
+    int code = -1, width = 0, height = 0, channels = 0;
+    (void)snprintf(base, sizeof base, "%s", name);
+    char *dot = strchr(base, '.');
+    if (dot) {
+        *dot = 0;
+        code = atoi(dot + 1);
+    }
+    (void)snprintf(file, sizeof file, "nets/%s.depth.pfm", name);
+    float *expected = dist_pfm_load(ctx, test_data_path(file), &width, &height, &channels);
+    (void)snprintf(file, sizeof file, "nets/%s.safetensors", base);
+    dist_net *net = dist_net_load_file(ctx, test_data_path(file));
+    dist_shape *shape = net ? dist_shape_create(ctx, net, code >= 0 ? dist_net_code(net, code) : NULL) : NULL;
+    if (CHECK_STATUS(DIST_OK, dist_context_status(ctx), ctx) && CHECK(width == SIDE && height == SIDE)) {
+        dist_field field = dist_shape_field(shape);
+        dist_camera camera = shape_camera(SIDE, SIDE);
+        static float depth[PIXELS];
+        dist_images out;
+        int first = (SIDE - size) / 2, wrong = 0, inside = 0, hits = 0;
+        camera.width = camera.height = size;
+        camera.cx -= (float)first;
+        camera.cy -= (float)first;
+        memset(&out, 0, sizeof out);
+        out.depth = depth;
+        out.mask = picture_a.mask;
+        out.status = picture_a.status;
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, NULL), ctx);
+        for (int i = 0; i < size * size; i++) {
+            float e = expected[(first + i / size) * SIDE + first + i % size];
+            if (picture_a.status[i] == DIST_RAY_INSIDE) inside++;
+            else if ((e > 0) != picture_a.mask[i]) wrong++;
+            else if (e > 0) off[hits++] = fabs((double)depth[i] - (double)e);
+        }
+        qsort(off, (size_t)hits, sizeof *off, order_doubles);
+        double p99 = hits ? off[hits * 99 / 100] : 0;
+        int good = CHECK(wrong * 500 <= size * size + (size < SIDE) * 500) & CHECK(p99 <= 1e-4) & CHECK(hits > 0);
+        if (!good || test_state.verbose)
+            printf("    %s: hits %d, wrong %d, inside %d, p50 %.1e, p99 %.1e, worst %.1e\n", name, hits, wrong, inside,
+                   hits ? off[hits / 2] : 0.0, p99, hits ? off[hits - 1] : 0.0);
+    }
+    dist_shape_destroy(shape);
+    dist_net_destroy(net);
+    dist_pfm_free(ctx, expected, width, height, channels);
+    dist_context_clear(ctx);
+}
+
+TEST(depth_of_real_decoders_is_that_of_double)
+{
+    static const char *const names[] = {"bob_spot.0", "bob_spot.1", "bunny_relu", "chairs.1", "chairs.3", "deepsdf_512.0",
+                                        "deepsdf_512.2", "deepsdf_512.4", "deepsdf_512.8", "deepsdf_512_he.0", "fox",
+                                        "mug_camera_bottle.0", "mug_camera_bottle.1", "mug_camera_bottle.2", "primitives.7",
+                                        "primitives.13", "primitives.15", "primitives.29", "rings", "round_cross.0", "round_cross.10",
+                                        "spot_geometry.0", "two_spheres_sine"};
+    FILE *probe = fopen(test_data_path("nets/fox.safetensors"), "rb");
+    if (!probe) SKIP("no test data: set DIST_DATA");
+    fclose(probe);
+    dist_context *ctx = test_context();
+    for (size_t k = 0; k < sizeof names / sizeof *names; k++) {
+        int wide = !strncmp(names[k], "deepsdf", 7) || !strncmp(names[k], "chairs", 6);
+        int slow = test_quick() || dist_context_isa(ctx) == DIST_ISA_SCALAR;
+        if (slow && k % 3) {
+            printf("    slow surroundings: %s is left out\n", names[k]);
+            continue;
+        }
+        compare_decoder(ctx, names[k], slow && wide ? 24 : SIDE);
+    }
+    dist_context_destroy(ctx);
+}
+
+int main(int argc, char **argv)
+{
+    test_begin(argc, argv);
+    RUN(every_crossing_is_hit_and_999_of_1000_within_the_error_bound);
+    RUN(no_plate_however_thin_is_missed);
+    RUN(no_plate_is_missed_silently_at_any_angle);
+    RUN(no_rod_thinner_than_a_pixel_is_missed);
+    RUN(cones_change_no_pixel);
+    RUN(grazing_rays_hit_within_the_bound_or_say_that_they_are_unresolved);
+    RUN(twelve_queries_finish_a_ray_once_it_has_crossed);
+    RUN(small_slopes_finish_or_report_with_an_honest_bound);
+    RUN(constant_fields_end_within_the_budget_with_the_right_status);
+    RUN(a_saturated_tanh_is_traced_to_its_surface);
+    RUN(a_camera_inside_the_sphere_starts_at_itself_and_ends_at_the_exit);
+    RUN(a_camera_inside_the_solid_gets_what_the_desc_says);
+    RUN(a_ray_that_starts_on_the_surface_leaves_it);
+    RUN(the_bounding_sphere_itself_is_no_obstacle);
+    RUN(an_object_behind_costs_no_query);
+    RUN(far_origins_hit_what_double_hits);
+    RUN(no_epsilon_is_too_small);
+    RUN(a_large_epsilon_dilates_by_no_more_than_itself);
+    RUN(every_step_scale_converges_and_the_others_are_refused);
+    RUN(the_nearest_of_two_surfaces_is_hit);
+    RUN(bumps_too_steep_for_the_figure_are_hit_at_a_crossing_and_end);
+    RUN(nan_from_the_field_is_not_finite_and_no_hit);
+    RUN(a_surface_without_slope_ends_within_the_budget);
+    RUN(equal_ends_of_a_bracket_fall_back_to_bisection);
+    RUN(no_ray_asks_more_than_its_budget_and_twelve);
+    RUN(statuses_are_truthful);
+    RUN(free_rays_take_directions_of_any_length);
+    RUN(free_rays_without_a_direction_are_not_finite);
+    RUN(many_free_rays_are_the_same_as_single_ones);
+    RUN(trace_refuses_what_it_cannot_trace);
+    RUN(each_row_of_the_ladder_asks_less_than_the_one_before);
+    RUN(the_paper_needs_52_steps_at_10_degrees_and_33_at_alpha_1_5);
+    RUN(the_paper_converges_up_to_slope_1_2_and_not_from_1_34_on);
+    RUN(depth_of_real_decoders_is_that_of_double);
+    return test_report();
+}

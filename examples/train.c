@@ -25,8 +25,8 @@ static const char usage[] =
     "  --steps N          steps of Adam (default 20000)\n"
     "  --epochs N         the same in passes over all shapes\n"
     "  --minutes M        the same by the clock: not reproducible\n"
-    "  --group N          shapes a step (default 32)\n"
-    "  --batch N          points of each of them (default 512)\n"
+    "  --group N          shapes a step (default 64)\n"
+    "  --batch N          points of each of them (default 256)\n"
     "  --pool N           points kept for each shape (default 24000)\n"
     "  --rate R           Adam's rate at the start, falling to nothing along a cosine (default 0.003)\n"
     "  --code-rate R      the same for the codes, which have their turn more rarely (default 0.015)\n"
@@ -113,8 +113,8 @@ static void pool_free(pool *p)
     free(p->sdf);
 }
 
-/* Nine in ten lie about the surface, at a mean distance that halves of them share: 0.05 and 0.0125 a coordinate; the
-   rest is anywhere in the sphere, so that nothing grows where no surface is. */
+/* Nine points in ten lie about the surface, every coordinate off it by a random amount with deviation 0.05 or 0.0125;
+   the tenth is anywhere in the sphere, so that nothing grows where no surface is. */
 static pool pool_make(dist_context *ctx, int family, unsigned index, size_t count)
 {
     shape s;
@@ -236,6 +236,16 @@ static dist_net *net_make(dist_context *ctx, const settings *how)
     return how->resume ? dist_net_load_file(ctx, how->resume) : dist_net_create(ctx, &desc);
 }
 
+/* A random code of about length 1, half of it shared by the family: to tell families apart is the first thing to learn,
+   and passes are saved where the codes say it from the start. */
+static void code_start(const settings *how, size_t family, size_t k, size_t size, float *code)
+{
+    rng shared = rng_begin(how->seed + 1000000ULL * (family + 1));
+    rng own = rng_begin(how->seed + 1000000ULL * (k + SHAPE_HELD_OUT));
+    float spread = sqrtf(0.5f / (float)size);
+    for (size_t j = 0; j < size; j++) code[j] = spread * (rng_normal(&shared) + rng_normal(&own));
+}
+
 static void trainer_begin(trainer *t, dist_context *ctx, const settings *how)
 {
     memset(t, 0, sizeof *t);
@@ -263,7 +273,7 @@ static void trainer_begin(trainer *t, dist_context *ctx, const settings *how)
     progress p = progress_begin("sampling the shapes");
     for (size_t k = 0; k < t->shape_count; k++) {
         float *code = t->codes + k * t->code_size;
-        for (size_t j = 0; j < t->code_size; j++) code[j] = rng_normal(&t->random) / sqrtf((float)t->code_size);
+        code_start(how, k / (size_t)how->shapes, k, t->code_size, code);
         if (how->resume) memcpy(code, dist_net_code(t->net, (int)k), t->code_size * sizeof(float));
         t->code_adam[k].moments = take_floats(2 * t->code_size);
         t->order[k] = k;
@@ -411,7 +421,18 @@ static int ascending(const void *a, const void *b)
     return (x > y) - (x < y);
 }
 
-/* Adam on the code alone, from the mean of the stored codes, as DeepSDF reconstructs. */
+/* Where a fit starts: in the middle of its family. */
+static void family_mean(const settings *how, const dist_net *net, int position, float *code)
+{
+    size_t n = (size_t)dist_net_code_size(net);
+    memset(code, 0, n * sizeof(float));
+    for (int i = 0; i < how->shapes; i++) {
+        const float *stored = dist_net_code(net, position * how->shapes + i);
+        for (size_t j = 0; j < n; j++) code[j] += stored[j] / (float)how->shapes;
+    }
+}
+
+/* Adam on the code alone, as DeepSDF reconstructs; code holds the start. */
 static void fit_code(dist_context *ctx, const settings *how, const dist_net *net, dist_shape *decoder,
                      const pool *samples, float *code)
 {
@@ -422,7 +443,6 @@ static void fit_code(dist_context *ctx, const settings *how, const dist_net *net
     dist_adam adam;
     memset(&adam, 0, sizeof adam);
     adam.moments = moments;
-    mean_code(net, code);
     rng r = rng_begin(how->seed);
     for (int i = 0; i < how->iterations; i++) {
         clamped_loss l = {target, loss, clamp_limit, 1.0f / FIT_BATCH};
@@ -481,6 +501,7 @@ static void evaluate_family(dist_context *ctx, const settings *how, const dist_n
         double result[2];
         if (held_out) {
             pool samples = pool_make(ctx, family, index, (size_t)how->pool);
+            family_mean(how, net, position, code);
             fit_code(ctx, how, net, decoder, &samples, code);
             pool_free(&samples);
         } else {
@@ -576,8 +597,8 @@ static settings parse(int argc, char **argv)
     how.width = 128;
     how.code = 32;
     how.steps = 20000;
-    how.group = 32;
-    how.batch = 512;
+    how.group = 64;
+    how.batch = 256;
     how.pool = 24000;
     how.rate = 3e-3f;
     how.code_rate = 1.5e-2f;

@@ -1,6 +1,7 @@
 /* SPDX-License-Identifier: MIT-0
    shapes.h - fields for the tests of tracing and rendering: worked out in double, rounded to float only at the end,
-   that count and note what they are asked, and the first crossing of a ray with them, in double, by plain small steps. */
+   that count and note what they are asked, and the first crossing of a ray with them, in double, by plain small
+   steps. */
 #ifndef DIST_TEST_SHAPES_H
 #define DIST_TEST_SHAPES_H
 
@@ -170,8 +171,8 @@ static double shape_along(const test_shape *shape, const double o[3], const doub
     return shape_exact(shape, p);
 }
 
-TEST_UNUSED static shape_crossing shape_cross(const test_shape *shape, const double o[3], const double d[3], double t0, double t1,
-                                              double lipschitz, double step, double epsilon)
+TEST_UNUSED static shape_crossing shape_cross(const test_shape *shape, const double o[3], const double d[3], double t0,
+                                              double t1, double lipschitz, double step, double epsilon)
 {
     shape_crossing c;
     memset(&c, 0, sizeof c);
@@ -218,7 +219,8 @@ TEST_UNUSED static int shape_enter(const double o[3], const double d[3], double 
     return *t1 > *t0;
 }
 
-/* Ray of pixel (x, y) in double, and its direction's z in the camera. The rotation is taken orthonormal, as the library does. */
+/* Ray of pixel (x, y) in double, and its direction's z in the camera. The rotation is taken orthonormal, as the
+   library does. */
 TEST_UNUSED static double shape_pixel(const dist_camera *camera, int x, int y, double o[3], double d[3])
 {
     disti_view view;

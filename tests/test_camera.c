@@ -136,8 +136,9 @@ TEST(look_at_of_garbage_gives_a_camera_that_render_refuses)
     float nan;
     memcpy(&nan, &bits, sizeof nan);
     float bad[3] = {nan, 0, 2};
-    const dist_camera cameras[4] = {dist_camera_look_at(8, 8, nan, eye, at, up), dist_camera_look_at(8, 8, 0.7f, bad, at, up),
-                                    dist_camera_look_at(8, 8, 0.7f, eye, bad, up), dist_camera_look_at(8, 8, 0.0f, eye, at, up)};
+    const dist_camera cameras[4] = {
+        dist_camera_look_at(8, 8, nan, eye, at, up), dist_camera_look_at(8, 8, 0.7f, bad, at, up),
+        dist_camera_look_at(8, 8, 0.7f, eye, bad, up), dist_camera_look_at(8, 8, 0.0f, eye, at, up)};
     for (int k = 0; k < 4; k++) {
         dist_context_clear(ctx);
         CHECK(dist_render(ctx, &field, &cameras[k], NULL, &out, NULL) < 0);
@@ -152,7 +153,8 @@ TEST(rays_are_those_of_double)
     for (int k = 0; k < 200; k++) {
         dist_camera c = plain_camera();
         random_pose(&r, &c);
-        c.fx = test_random_float(&r, 10, 300) * (k % 3 ? 1.0f : -1.0f); /* row 27: unlike, mirrored, skewed, off the picture */
+        c.fx = test_random_float(&r, 10, 300) *
+               (k % 3 ? 1.0f : -1.0f); /* row 27: unlike, mirrored, skewed, off the picture */
         c.fy = test_random_float(&r, 10, 300);
         c.skew = test_random_float(&r, -5, 5);
         c.cx = test_random_float(&r, -500, 500);
@@ -230,7 +232,7 @@ TEST(colmap_goes_there_and_back_in_every_branch)
     for (int k = 0; k < 400; k++) {
         double q[4], m[9];
         random_quaternion(&r, q);
-        if (k % 5 == 4) q[k / 5 % 4] = 0;                                                 /* a zero among the four */
+        if (k % 5 == 4) q[k / 5 % 4] = 0;                                      /* a zero among the four */
         if (k < 4) q[0] = k == 0, q[1] = k == 1, q[2] = k == 2, q[3] = k == 3; /* half turns about the axes */
         double length = sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
         for (int i = 0; i < 4; i++) q[i] /= length;

@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: MIT-0
-   Contexts: hooks, memory that runs out anywhere, errors and their sentences, the caller's floating-point state. Numbers in
-   comments are rows of the table of hard cases. */
+   Contexts: hooks, memory that runs out anywhere, errors and their sentences, the caller's floating-point state.
+   Numbers in comments are rows of the table of hard cases. */
 #include "shapes.h"
 
 #if defined(__x86_64__) || defined(_M_X64)
@@ -45,8 +45,8 @@ static dist_images picture_planes(pictures *p, dist_stats *stats)
     return out;
 }
 
-/* One of everything: made, used, destroyed. Notes in `calls` how many requests of memory the uses themselves made; returns
-   how many of the creations failed. */
+/* One of everything: made, used, destroyed. Notes in `calls` how many requests of memory the uses themselves made;
+   returns how many of the creations failed. */
 static int whole_life(test_allocator *allocator, const dist_context_desc *desc, pictures *p, size_t *calls)
 {
     static unsigned char file[65536];
@@ -180,7 +180,9 @@ TEST(memory_that_runs_out_anywhere_is_a_status_and_leaks_nothing)
             allocator.fail_onwards = onwards;
             int failed = whole_life(&allocator, &desc, &p, &calls);
             int good = CHECK(failed > 0) & CHECK_EQUAL(0, allocator.live_blocks) & CHECK_EQUAL(0, allocator.errors);
-            if (!good) printf("    request %lu of %lu, %s\n", (unsigned long)n, (unsigned long)requests, onwards ? "from it on" : "once");
+            if (!good)
+                printf("    request %lu of %lu, %s\n", (unsigned long)n, (unsigned long)requests,
+                       onwards ? "from it on" : "once");
         }
     }
     if (test_state.verbose) printf("    %lu requests\n", (unsigned long)requests);
@@ -249,17 +251,18 @@ TEST(a_scheduler_of_any_order_gives_the_same_pictures_and_gradients)
     }
 }
 
-/* ---- what is refused -------------------------------------------------------------------------------------------------- */
+/* ---- what is refused -------------------------------------------------------------------------------------------- */
 
-static void wrong_sgemm(void *user, int transpose_a, int transpose_b, int m, int n, int k, float alpha, const float *a, int lda,
-                        const float *b, int ldb, float beta, float *c, int ldc)
+static void wrong_sgemm(void *user, int transpose_a, int transpose_b, int m, int n, int k, float alpha, const float *a,
+                        int lda, const float *b, int ldb, float beta, float *c, int ldc)
 {
     int garbage = *(const int *)user;
     for (int i = 0; i < m; i++) {
         for (int j = 0; j < n; j++) {
             float sum = 0;
             for (int l = 0; l < k; l++)
-                sum += (transpose_a ? a[l * lda + i] : a[i * lda + l]) * ((transpose_b != (garbage == 0)) ? b[j * ldb + l] : b[l * ldb + j]);
+                sum += (transpose_a ? a[l * lda + i] : a[i * lda + l]) *
+                       ((transpose_b != (garbage == 0)) ? b[j * ldb + l] : b[l * ldb + j]);
             if (garbage < 2) c[i * ldc + j] = alpha * sum + beta * c[i * ldc + j];
         }
     }
@@ -499,7 +502,7 @@ TEST(objects_of_another_context_are_refused)
     dist_context_destroy(theirs);
 }
 
-/* ---- floating-point state ------------------------------------------------------------------------------------------------ */
+/* ---- floating-point state --------------------------------------------------------------------------------------- */
 
 #if defined(__x86_64__) || defined(_M_X64)
 enum { STATES = 7 };
@@ -552,8 +555,10 @@ TEST(the_callers_floating_point_state_neither_matters_nor_changes)
         }
         CHECK(masks <= 1);
         CHECK_EQUAL(0, off);
-        for (int i = 0; i < CODE; i++) CHECK_NEAR(first.code[i], other.code[i], 1e-3 * (1 + fabs((double)first.code[i])));
-        for (int i = 0; i < 3; i++) CHECK_NEAR(first.rotation[i], other.rotation[i], 1e-3 * (1 + fabs((double)first.rotation[i])));
+        for (int i = 0; i < CODE; i++)
+            CHECK_NEAR(first.code[i], other.code[i], 1e-3 * (1 + fabs((double)first.code[i])));
+        for (int i = 0; i < 3; i++)
+            CHECK_NEAR(first.rotation[i], other.rotation[i], 1e-3 * (1 + fabs((double)first.rotation[i])));
     }
 }
 

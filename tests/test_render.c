@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: MIT-0
-   Pictures: what each plane means, what it costs, and that size, distance, scale, workers and order of tasks change nothing.
-   Numbers in comments are rows of the table of hard cases. */
+   Pictures: what each plane means, what it costs, and that size, distance, scale, workers and order of tasks change
+   nothing. Numbers in comments are rows of the table of hard cases. */
 #include "shapes.h"
 
 enum { SIDE = 96, PIXELS = 8192 * 2 };
@@ -57,7 +57,7 @@ static void normal_of(const test_shape *shape, const double p[3], double n[3])
     for (int k = 0; k < 3; k++) n[k] /= sqrt(length);
 }
 
-/* ---- what the planes mean ------------------------------------------------------------------------------------------- */
+/* ---- what the planes mean --------------------------------------------------------------------------------------- */
 
 TEST(planes_mean_what_the_interface_says)
 {
@@ -129,14 +129,23 @@ TEST(planes_left_out_are_not_touched_and_cost_nothing)
         CHECK(b.stats.queries == (unsigned long long)shape.queries);
         const unsigned char *bytes = (const unsigned char *)fresh, *first = NULL;
         size_t size = 0, touched = 0;
-        if (k == 0) first = (const unsigned char *)b.depth, size = sizeof(float) * SIDE * SIDE, CHECK_BYTES(size, a.depth, b.depth);
-        if (k == 1) first = (const unsigned char *)b.distance, size = sizeof(float) * SIDE * SIDE, CHECK_BYTES(size, a.distance, b.distance);
-        if (k == 2) first = (const unsigned char *)b.normal, size = sizeof(float) * 3 * SIDE * SIDE, CHECK_BYTES(size, a.normal, b.normal);
+        if (k == 0)
+            first = (const unsigned char *)b.depth, size = sizeof(float) * SIDE * SIDE,
+            CHECK_BYTES(size, a.depth, b.depth);
+        if (k == 1)
+            first = (const unsigned char *)b.distance, size = sizeof(float) * SIDE * SIDE,
+            CHECK_BYTES(size, a.distance, b.distance);
+        if (k == 2)
+            first = (const unsigned char *)b.normal, size = sizeof(float) * 3 * SIDE * SIDE,
+            CHECK_BYTES(size, a.normal, b.normal);
         if (k == 3)
-            first = (const unsigned char *)b.silhouette, size = sizeof(float) * SIDE * SIDE, CHECK_BYTES(size, a.silhouette, b.silhouette);
+            first = (const unsigned char *)b.silhouette, size = sizeof(float) * SIDE * SIDE,
+            CHECK_BYTES(size, a.silhouette, b.silhouette);
         if (k == 4) first = b.mask, size = SIDE * SIDE, CHECK_BYTES(size, a.mask, b.mask);
         if (k == 5) first = b.status, size = SIDE * SIDE, CHECK_BYTES(size, a.status, b.status);
-        if (k == 6) first = (const unsigned char *)b.error, size = sizeof(float) * SIDE * SIDE, CHECK_BYTES(size, a.error, b.error);
+        if (k == 6)
+            first = (const unsigned char *)b.error, size = sizeof(float) * SIDE * SIDE,
+            CHECK_BYTES(size, a.error, b.error);
         for (size_t i = 0; i < offsetof(planes, stats); i++)
             touched += bytes[i] != 0x5a && !(first && bytes + i >= first && bytes + i < first + size);
         CHECK_EQUAL(0, touched);
@@ -178,7 +187,8 @@ TEST(color_is_the_fields_at_the_hit)
                        a.color[3 * i + k], 1e-6);
     }
     const dist_stats *s = &a.stats;
-    CHECK(s->queries == s->cone_queries + s->march_queries + s->refine_queries + s->silhouette_queries + s->normal_queries + s->hits);
+    CHECK(s->queries ==
+          s->cone_queries + s->march_queries + s->refine_queries + s->silhouette_queries + s->normal_queries + s->hits);
     dist_context_destroy(ctx);
 }
 
@@ -237,14 +247,15 @@ TEST(a_surface_without_slope_has_normal_zero_or_unit_and_nothing_is_nan)
         for (int i = 0; i < 32 * 32; i++) {
             const float *n = a.normal + 3 * i;
             double length = shape_length((double)n[0], (double)n[1], (double)n[2]);
-            CHECK(test_finite((double)a.depth[i]) && test_finite((double)a.silhouette[i]) && test_finite((double)a.error[i]));
+            CHECK(test_finite((double)a.depth[i]) && test_finite((double)a.silhouette[i]) &&
+                  test_finite((double)a.error[i]));
             CHECK(length < 1e-6 || fabs(length - 1) < 1e-5);
         }
     }
     dist_context_destroy(ctx);
 }
 
-/* ---- silhouette ------------------------------------------------------------------------------------------------------ */
+/* ---- silhouette ------------------------------------------------------------------------------------------------- */
 
 /* Smallest f along the part of a ray within the sphere, by 400 samples and golden sections. */
 static double least_along(const test_shape *shape, const double o[3], const double d[3], double t0, double t1)
@@ -290,7 +301,8 @@ static void check_silhouette(double reach)
             }
             int good = CHECK(misses > 100) & CHECK_EQUAL(0, off);
             if (!good || test_state.verbose)
-                printf("    shape %d, %s: %d of %d misses off, worst %.1e\n", k, cones ? "no cones" : "cones", off, misses, worst);
+                printf("    shape %d, %s: %d of %d misses off, worst %.1e\n", k, cones ? "no cones" : "cones", off,
+                       misses, worst);
         }
     }
     dist_context_destroy(ctx);
@@ -379,7 +391,7 @@ TEST(silhouette_is_continuous_and_the_mask_changes_by_single_pixels)
     dist_context_destroy(ctx);
 }
 
-/* ---- size, scale, distance ---------------------------------------------------------------------------------------------- */
+/* ---- size, scale, distance -------------------------------------------------------------------------------------- */
 
 /* 12 */
 TEST(scale_of_the_world_changes_nothing)
@@ -402,7 +414,8 @@ TEST(scale_of_the_world_changes_nothing)
         for (int i = 0; i < 48 * 48; i++) {
             masks += a.mask[i] != b.mask[i];
             if (!a.mask[i] || !b.mask[i]) continue;
-            off += fabs((double)b.depth[i] / scales[k] - (double)a.depth[i]) > 1e-5 + (double)a.error[i] + (double)b.error[i] / scales[k];
+            off += fabs((double)b.depth[i] / scales[k] - (double)a.depth[i]) >
+                   1e-5 + (double)a.error[i] + (double)b.error[i] / scales[k];
             for (int j = 0; j < 3; j++) off += fabs((double)(a.normal[3 * i + j] - b.normal[3 * i + j])) > 1e-3;
         }
         CHECK_EQUAL(0, off);
@@ -465,8 +478,10 @@ TEST(focal_lengths_from_a_thousandth_to_a_million_are_finite)
         int wrong = 0;
         for (int i = 0; i < 40 * 30; i++) {
             double o[3], d[3], along = 0;
-            CHECK(test_finite((double)a.depth[i]) && test_finite((double)a.distance[i]) && test_finite((double)a.silhouette[i]));
-            CHECK(test_finite((double)a.normal[3 * i]) && test_finite((double)a.error[i]) && a.status[i] != DIST_RAY_NOT_FINITE);
+            CHECK(test_finite((double)a.depth[i]) && test_finite((double)a.distance[i]) &&
+                  test_finite((double)a.silhouette[i]));
+            CHECK(test_finite((double)a.normal[3 * i]) && test_finite((double)a.error[i]) &&
+                  a.status[i] != DIST_RAY_NOT_FINITE);
             shape_pixel(&camera, i % 40, i / 40, o, d);
             CHECK_NEAR(1, shape_length(d[0], d[1], d[2]), 1e-12);
             for (int j = 0; j < 3; j++) along -= o[j] * d[j];
@@ -482,7 +497,8 @@ TEST(focal_lengths_from_a_thousandth_to_a_million_are_finite)
 TEST(pictures_of_any_shape_agree_with_single_pixels)
 {
     dist_context *ctx = shape_context();
-    const int sizes[10][2] = {{1, 1}, {1, 4096}, {4096, 1}, {2, 3}, {5, 7}, {31, 33}, {33, 31}, {65, 2}, {63, 129}, {97, 1}};
+    const int sizes[10][2] = {{1, 1},   {1, 4096}, {4096, 1}, {2, 3},    {5, 7},
+                              {31, 33}, {33, 31},  {65, 2},   {63, 129}, {97, 1}};
     for (int k = 0; k < 10; k++) {
         int w = sizes[k][0], h = sizes[k][1], step = 1 + w * h / 150;
         float eye[3] = {1.2f, 0.9f, 1.8f}, at[3] = {0, 0, 0}, up[3] = {0, 1, 0};
@@ -509,7 +525,8 @@ TEST(pictures_of_any_shape_agree_with_single_pixels)
             shape_pixel(&camera, i % w, i / w, o, d);
             hits += a.mask[i];
             if (a.mask[i] && b.mask[0]) {
-                wrong += fabs((double)a.distance[i] - (double)b.distance[0]) > (double)a.error[i] + (double)b.error[0] + 2e-5;
+                wrong += fabs((double)a.distance[i] - (double)b.distance[0]) >
+                         (double)a.error[i] + (double)b.error[0] + 2e-5;
             } else if (a.mask[i] != b.mask[0]) {
                 shape_crossing c;
                 memset(&c, 0, sizeof c);
@@ -575,7 +592,7 @@ TEST(huge_tapes_are_refused_or_had_without_overflow)
     CHECK_EQUAL(0, allocator.live_blocks);
 }
 
-/* ---- the same bits --------------------------------------------------------------------------------------------------------- */
+/* ---- the same bits ---------------------------------------------------------------------------------------------- */
 
 /* 40 */
 TEST(workers_and_order_of_tasks_change_no_bit)
@@ -618,7 +635,7 @@ TEST(workers_and_order_of_tasks_change_no_bit)
     }
 }
 
-/* ---- counts ----------------------------------------------------------------------------------------------------------------- */
+/* ---- counts ----------------------------------------------------------------------------------------------------- */
 
 TEST(counts_add_up)
 {
@@ -633,8 +650,9 @@ TEST(counts_add_up)
         float error = 0;
         how.trace = k >= 9 ? DIST_TRACE_PAPER : DIST_TRACE_GUARDED;
         how.max_steps = k >= 3 && k < 6 ? 8 : 0;
-        if (k >= 6 && k < 9) camera = dist_camera_look_at(64, 48, 1.5f, (const float[3]){0.3f, 0.1f, 0.2f}, (const float[3]){1, 0, 0},
-                                                          (const float[3]){0, 1, 0});
+        if (k >= 6 && k < 9)
+            camera = dist_camera_look_at(64, 48, 1.5f, (const float[3]){0.3f, 0.1f, 0.2f}, (const float[3]){1, 0, 0},
+                                         (const float[3]){0, 1, 0});
         CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
         for (int i = 0; i < 64 * 48; i++) {
             double o[3], d[3], t0, t1;
@@ -652,7 +670,8 @@ TEST(counts_add_up)
         CHECK_EQUAL(seen[DIST_RAY_INSIDE], s->inside);
         CHECK_EQUAL(seen[DIST_RAY_PLATEAU], s->plateau);
         CHECK_EQUAL(seen[DIST_RAY_NOT_FINITE], s->not_finite);
-        CHECK_EQUAL(s->queries, s->cone_queries + s->march_queries + s->refine_queries + s->silhouette_queries + s->normal_queries);
+        CHECK_EQUAL(s->queries,
+                    s->cone_queries + s->march_queries + s->refine_queries + s->silhouette_queries + s->normal_queries);
         CHECK_EQUAL(shape.queries, s->queries);
         CHECK_NEAR(error, s->error, 0);
         CHECK_NEAR(1, s->lipschitz, 0);
@@ -687,7 +706,7 @@ TEST(operations_done_are_no_more_than_a_dense_net_would_do)
     dist_context_destroy(ctx);
 }
 
-/* ---- refusals, inside, NaN -------------------------------------------------------------------------------------------------- */
+/* ---- refusals, inside, NaN -------------------------------------------------------------------------------------- */
 
 TEST(a_tape_is_for_its_size_and_trace)
 {
@@ -777,7 +796,8 @@ TEST(render_refuses_null_and_garbage_with_a_sentence)
         if (k == 7) part = "out is NULL";
         if (k == 1) field.eval_fn = NULL;
         dist_context_clear(ctx);
-        CHECK_STATUS(DIST_BAD_ARGUMENT, dist_render(ctx, k ? &field : NULL, &camera, &how, k == 7 ? NULL : &out, NULL), ctx);
+        CHECK_STATUS(DIST_BAD_ARGUMENT, dist_render(ctx, k ? &field : NULL, &camera, &how, k == 7 ? NULL : &out, NULL),
+                     ctx);
         CHECK_TEXT("dist_render: ", dist_context_message(ctx));
         CHECK_TEXT(part, dist_context_message(ctx));
         CHECK_EQUAL(0x5a, a.mask[0]);
@@ -836,8 +856,10 @@ TEST(nan_from_the_field_spoils_only_its_pixels)
         int bad = 0, changed = 0;
         for (int i = 0; i < 64 * 64; i++) {
             double o[3], d[3], along = 0;
-            CHECK(test_finite((double)b.depth[i]) && test_finite((double)b.distance[i]) && test_finite((double)b.silhouette[i]));
-            CHECK(test_finite((double)b.error[i]) && test_finite((double)b.normal[3 * i]) && test_finite((double)b.normal[3 * i + 2]));
+            CHECK(test_finite((double)b.depth[i]) && test_finite((double)b.distance[i]) &&
+                  test_finite((double)b.silhouette[i]));
+            CHECK(test_finite((double)b.error[i]) && test_finite((double)b.normal[3 * i]) &&
+                  test_finite((double)b.normal[3 * i + 2]));
             if (b.status[i] == DIST_RAY_NOT_FINITE) {
                 bad++;
                 CHECK_EQUAL(0, b.mask[i]);

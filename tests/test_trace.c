@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: MIT-0
-   Both tracers against fields worked out in double: what is hit, how far off, what is said of it, and at what price. Numbers in
-   comments are rows of the table of hard cases. */
+   Both tracers against fields worked out in double: what is hit, how far off, what is said of it, and at what price.
+   Numbers in comments are rows of the table of hard cases. */
 #include "shapes.h"
 
 enum { SIDE = 128, PIXELS = SIDE * SIDE };
@@ -13,8 +13,8 @@ typedef struct picture {
 
 static picture picture_a, picture_b;
 
-static dist_status picture_render(dist_context *ctx, const dist_field *field, const dist_camera *camera, const dist_render_desc *how,
-                                  picture *p)
+static dist_status picture_render(dist_context *ctx, const dist_field *field, const dist_camera *camera,
+                                  const dist_render_desc *how, picture *p)
 {
     dist_images out;
     memset(&out, 0, sizeof out);
@@ -54,7 +54,8 @@ typedef struct verdict {
     int unresolved;
 } verdict;
 
-static verdict judge(const test_shape *shape, const dist_camera *camera, double radius, double lipschitz, double step, const picture *p)
+static verdict judge(const test_shape *shape, const dist_camera *camera, double radius, double lipschitz, double step,
+                     const picture *p)
 {
     verdict v;
     memset(&v, 0, sizeof v);
@@ -80,7 +81,8 @@ static verdict judge(const test_shape *shape, const dist_camera *camera, double 
         }
         if (!p->mask[i] || !c.crosses || c.touched) continue;
         /* f is known to half a float's spacing, so t is to that over the slope along the ray. */
-        double off = fabs((double)p->distance[i] - c.t), rounding = 2.5e-7 * c.t + 3e-7 * radius + 6e-8 / fmax(fabs(c.slope), 1e-3);
+        double off = fabs((double)p->distance[i] - c.t),
+               rounding = 2.5e-7 * c.t + 3e-7 * radius + 6e-8 / fmax(fabs(c.slope), 1e-3);
         v.judged++;
         v.worst = fmax(v.worst, off);
         v.broken += off > (double)p->error[i] + rounding;
@@ -147,9 +149,11 @@ TEST(every_crossing_is_hit_and_999_of_1000_within_the_error_bound)
         CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, NULL, &picture_a), ctx);
         verdict v = judge(&cases[k].shape, &camera, cases[k].radius, cases[k].exact, 1e-5, &picture_a);
         int good = CHECK_EQUAL(0, v.missed) & CHECK_EQUAL(0, v.phantom) & CHECK(v.broken * 1000 <= v.judged) &
-                   CHECK(v.spent * 500 <= v.crossing + 1500) & CHECK(v.judged > v.crossing * 9 / 10) & CHECK(v.outline < v.crossing / 50 + 10);
+                   CHECK(v.spent * 500 <= v.crossing + 1500) & CHECK(v.judged > v.crossing * 9 / 10) &
+                   CHECK(v.outline < v.crossing / 50 + 10);
         if (!good || test_state.verbose)
-            printf("    %s: crossing %d, missed %d, phantom %d, outline %d, judged %d, off by more than the bound %d, worst %.1e, "
+            printf("    %s: crossing %d, missed %d, phantom %d, outline %d, judged %d, off by more than the bound %d, "
+                   "worst %.1e, "
                    "unresolved %d, queries %llu\n",
                    cases[k].name, v.crossing, v.missed, v.phantom, v.outline, v.judged, v.broken, v.worst, v.spent,
                    picture_a.stats.queries);
@@ -172,8 +176,9 @@ TEST(no_plate_however_thin_is_missed)
             int good = CHECK_EQUAL(0, v.missed) & CHECK_EQUAL(0, v.spent) & CHECK_EQUAL(0, v.phantom) &
                        CHECK(v.broken * 1000 <= v.judged);
             if (!good || test_state.verbose)
-                printf("    %g thick: crossing %d, missed %d, phantom %d, outline %d, judged %d, broken %d, worst %.1e\n", thin[k],
-                       v.crossing, v.missed, v.phantom, v.outline, v.judged, v.broken, v.worst);
+                printf(
+                    "    %g thick: crossing %d, missed %d, phantom %d, outline %d, judged %d, broken %d, worst %.1e\n",
+                    thin[k], v.crossing, v.missed, v.phantom, v.outline, v.judged, v.broken, v.worst);
         }
     }
     dist_context_destroy(ctx);
@@ -199,7 +204,8 @@ TEST(no_plate_is_missed_silently_at_any_angle)
                 d[3 * j + 1] = (float)(cos(angle) * sin(turn));
                 d[3 * j + 2] = (float)-sin(angle);
                 for (size_t i = 0; i < 3; i++)
-                    o[3 * j + i] = (float)((i < 2 ? test_random_double(&r, -0.3, 0.3) : 0) - away * (double)d[3 * j + i]);
+                    o[3 * j + i] =
+                        (float)((i < 2 ? test_random_double(&r, -0.3, 0.3) : 0) - away * (double)d[3 * j + i]);
             }
             CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, 200, o, d, NULL, hits, NULL), ctx);
             for (int j = 0; j < 200; j++) {
@@ -207,7 +213,8 @@ TEST(no_plate_is_missed_silently_at_any_angle)
                 spent += hits[j].status == DIST_RAY_UNRESOLVED;
             }
             if (!CHECK_EQUAL(0, missed) || (test_state.verbose && spent))
-                printf("    %g thick at %d degrees: %d of 200 missed, %d unresolved\n", thin[k], degrees[a], missed, spent);
+                printf("    %g thick at %d degrees: %d of 200 missed, %d unresolved\n", thin[k], degrees[a], missed,
+                       spent);
             if (degrees[a] >= 4) CHECK_EQUAL(0, spent);
         }
     }
@@ -224,10 +231,11 @@ TEST(no_rod_thinner_than_a_pixel_is_missed)
         dist_field field = shape_field(&shape, 1, 1);
         CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, NULL, &picture_a), ctx);
         verdict v = judge(&shape, &camera, 1, 1, 1e-5, &picture_a);
-        int good = CHECK_EQUAL(0, v.missed) & CHECK_EQUAL(0, v.spent) & CHECK_EQUAL(0, v.phantom) & CHECK(v.crossing > 0 || side() < SIDE);
+        int good = CHECK_EQUAL(0, v.missed) & CHECK_EQUAL(0, v.spent) & CHECK_EQUAL(0, v.phantom) &
+                   CHECK(v.crossing > 0 || side() < SIDE);
         if (!good || test_state.verbose)
-            printf("    %g thin: crossing %d, missed %d, phantom %d, outline %d, queries %llu\n", radius[k], v.crossing, v.missed,
-                   v.phantom, v.outline, picture_a.stats.queries);
+            printf("    %g thin: crossing %d, missed %d, phantom %d, outline %d, queries %llu\n", radius[k], v.crossing,
+                   v.missed, v.phantom, v.outline, picture_a.stats.queries);
     }
     dist_context_destroy(ctx);
 }
@@ -267,17 +275,17 @@ TEST(cones_change_no_pixel)
         int good = CHECK_EQUAL(0, masks) & CHECK_EQUAL(0, off) & CHECK(touching <= 10);
         CHECK(picture_b.stats.cone_queries == 0);
         if (!good || test_state.verbose)
-            printf("    %s: masks %d, distances %d, rays that touch %d; queries %llu with, %llu without\n", cases[k].name, masks, off,
-                   touching, picture_a.stats.queries, picture_b.stats.queries);
+            printf("    %s: masks %d, distances %d, rays that touch %d; queries %llu with, %llu without\n",
+                   cases[k].name, masks, off, touching, picture_a.stats.queries, picture_b.stats.queries);
     }
     dist_context_destroy(ctx);
 }
 
-/* ---- single rays -------------------------------------------------------------------------------------------------- */
+/* ---- single rays ------------------------------------------------------------------------------------------------ */
 
 /* Traces one ray against a shape; notes gets its queries unless NULL. */
-static dist_hit trace_one(dist_context *ctx, test_shape *shape, double radius, double lipschitz, const float o[3], const float d[3],
-                          const dist_render_desc *how, float *notes)
+static dist_hit trace_one(dist_context *ctx, test_shape *shape, double radius, double lipschitz, const float o[3],
+                          const float d[3], const dist_render_desc *how, float *notes)
 {
     dist_hit hit;
     memset(&hit, 0, sizeof hit);
@@ -318,7 +326,8 @@ TEST(grazing_rays_hit_within_the_bound_or_say_that_they_are_unresolved)
             double size = shape_length((double)d[0], (double)d[1], (double)d[2]), expected = -from / by * size;
             CHECK(hit.status == DIST_RAY_HIT || hit.status == DIST_RAY_UNRESOLVED);
             if (degrees[k] >= 3) CHECK_EQUAL(DIST_RAY_HIT, hit.status);
-            if (hit.status == DIST_RAY_HIT) CHECK_NEAR(expected, hit.distance, (double)hit.error + 1e-6 + 2e-7 / sin(angle));
+            if (hit.status == DIST_RAY_HIT)
+                CHECK_NEAR(expected, hit.distance, (double)hit.error + 1e-6 + 2e-7 / sin(angle));
             else CHECK(fabs((double)hit.sdf) < 1e-2);
         }
         if (degrees[k] >= 10) CHECK(most <= 33); /* the paper's rule at alpha 1.5 */
@@ -333,8 +342,8 @@ static long queries_after_crossing(const test_shape *shape)
     return at < shape->queries ? shape->queries - at - 1 : -1;
 }
 
-/* 2: the Lipschitz figure is wrong for all of these, so that the surface is crossed. Without a clamp it is half the truth,
-   or the first step would leave the sphere. */
+/* 2: the Lipschitz figure is wrong for all of these, so that the surface is crossed. Without a clamp it is half the
+   truth, or the first step would leave the sphere. */
 TEST(twelve_queries_finish_a_ray_once_it_has_crossed)
 {
     dist_context *ctx = shape_context();
@@ -357,7 +366,8 @@ TEST(twelve_queries_finish_a_ray_once_it_has_crossed)
                     o[i] *= 2.0f;
                     d[i] = test_random_float(&r, -0.7f, 0.7f) - o[i];
                 }
-                dist_hit hit = trace_one(ctx, &shape, 1, shape.clamp > 0 ? 1 : fmax(1, 0.5 * slopes[k]), o, d, NULL, notes);
+                dist_hit hit =
+                    trace_one(ctx, &shape, 1, shape.clamp > 0 ? 1 : fmax(1, 0.5 * slopes[k]), o, d, NULL, notes);
                 long after = queries_after_crossing(&shape);
                 if (after < 0) continue;
                 crossed++;
@@ -369,13 +379,16 @@ TEST(twelve_queries_finish_a_ray_once_it_has_crossed)
                 CHECK_NEAR(0, shape_exact(&shape, p), (double)hit.error + 2e-6);
             }
             over += worse;
-            if (worse) printf("    slope %g%s, kind %d: %d of %d rays over\n", slopes[k], kind % 2 ? ", clamped" : "", kind / 2, worse, rays);
+            if (worse)
+                printf("    slope %g%s, kind %d: %d of %d rays over\n", slopes[k], kind % 2 ? ", clamped" : "",
+                       kind / 2, worse, rays);
         }
     }
     CHECK(crossed > rays * 12);
     CHECK(most <= 20);
     CHECK_EQUAL(0, over);
-    if (test_state.verbose || over) printf("    at most %ld queries after the crossing, %d of %d rays over 12\n", most, over, crossed);
+    if (test_state.verbose || over)
+        printf("    at most %ld queries after the crossing, %d of %d rays over 12\n", most, over, crossed);
     dist_context_destroy(ctx);
 }
 
@@ -395,7 +408,8 @@ TEST(small_slopes_finish_or_report_with_an_honest_bound)
             double expected = along - sqrt(0.36 - off * off);
             hits += hit.status == DIST_RAY_HIT;
             CHECK(hit.status == DIST_RAY_HIT || hit.status == DIST_RAY_UNRESOLVED);
-            if (hit.status == DIST_RAY_HIT) CHECK_NEAR(expected, hit.distance, (double)hit.error + 2e-6 + 1e-7 / slopes[k]);
+            if (hit.status == DIST_RAY_HIT)
+                CHECK_NEAR(expected, hit.distance, (double)hit.error + 2e-6 + 1e-7 / slopes[k]);
             else CHECK((double)hit.sdf > 0);
         }
         if (test_state.verbose) printf("    slope %g: %d of 40 hit\n", slopes[k], hits);
@@ -409,8 +423,8 @@ TEST(constant_fields_end_within_the_budget_with_the_right_status)
 {
     dist_context *ctx = shape_context();
     const double values[8] = {1, 0.3, 1e-2, 1e-3, 2.5e-5, 0, -0.3, -2.5e-5};
-    const int expected[8] = {DIST_RAY_MISS, DIST_RAY_MISS, -1, -1, DIST_RAY_PLATEAU, DIST_RAY_PLATEAU, DIST_RAY_INSIDE,
-                             DIST_RAY_INSIDE};
+    const int expected[8] = {DIST_RAY_MISS,   DIST_RAY_MISS,  -1, -1, DIST_RAY_PLATEAU, DIST_RAY_PLATEAU,
+                             DIST_RAY_INSIDE, DIST_RAY_INSIDE};
     for (int k = 0; k < 8; k++) {
         test_shape shape = shape_make(SHAPE_CONSTANT, values[k], 0, 0, 0);
         float o[3] = {0.1f, 0.2f, 2.5f}, d[3] = {0, 0, -1};
@@ -599,7 +613,8 @@ TEST(far_origins_hit_what_double_hits)
             if (off > 0.7 || hit.status != DIST_RAY_HIT) continue;
             hits++;
             double expected = along - sqrt(0.49 - square), grazing = sqrt(0.49 - square) / 0.7;
-            CHECK_NEAR(expected, hit.distance, (double)hit.error + (2e-6 + 1e-14 * away[k]) / fmax(grazing, 0.05) + 6e-8 * expected);
+            CHECK_NEAR(expected, hit.distance,
+                       (double)hit.error + (2e-6 + 1e-14 * away[k]) / fmax(grazing, 0.05) + 6e-8 * expected);
             CHECK((double)hit.error < 1e-4 / fmax(grazing, 1e-2));
         }
         CHECK(hits > 50 || away[k] > 1e7);
@@ -622,7 +637,8 @@ TEST(no_epsilon_is_too_small)
         verdict v = judge(&shape, &camera, 1, 1, 1e-5, &picture_a);
         CHECK_EQUAL(0, v.missed);
         CHECK_EQUAL(0, v.phantom);
-        CHECK(picture_a.stats.epsilon >= 1e-7f && picture_a.stats.epsilon >= epsilons[k] && picture_a.stats.epsilon <= 1e-4f);
+        CHECK(picture_a.stats.epsilon >= 1e-7f && picture_a.stats.epsilon >= epsilons[k] &&
+              picture_a.stats.epsilon <= 1e-4f);
         CHECK(picture_a.stats.queries < 64 * 64 * 20);
         if (k > 0 && k < 4) CHECK(v.broken * 1000 <= v.judged);
     }
@@ -765,7 +781,8 @@ TEST(nan_from_the_field_is_not_finite_and_no_hit)
         unsigned long long bad = 0;
         for (size_t j = 0; j < 50; j++) {
             double x = fabs((double)o[3 * j]);
-            CHECK(test_finite((double)hits[j].distance) && test_finite((double)hits[j].error) && test_finite((double)hits[j].sdf));
+            CHECK(test_finite((double)hits[j].distance) && test_finite((double)hits[j].error) &&
+                  test_finite((double)hits[j].sdf));
             if (x > 0.201) CHECK_EQUAL(DIST_RAY_HIT, hits[j].status);
             if (x < 0.15) CHECK_EQUAL(DIST_RAY_NOT_FINITE, hits[j].status);
             bad += hits[j].status == DIST_RAY_NOT_FINITE;
@@ -813,7 +830,7 @@ TEST(equal_ends_of_a_bracket_fall_back_to_bisection)
     dist_context_destroy(ctx);
 }
 
-/* ---- budgets, statuses, free rays ----------------------------------------------------------------------------------- */
+/* ---- budgets, statuses, free rays ------------------------------------------------------------------------------- */
 
 TEST(no_ray_asks_more_than_its_budget_and_twelve)
 {
@@ -989,7 +1006,8 @@ TEST(trace_refuses_what_it_cannot_trace)
         dist_context_clear(ctx);
         shape.queries = 0;
         CHECK_STATUS(DIST_BAD_ARGUMENT,
-                     dist_trace(ctx, f ? &field : NULL, 1, origin ? o : NULL, direction ? d : NULL, &how, result ? &hit : NULL, NULL),
+                     dist_trace(ctx, f ? &field : NULL, 1, origin ? o : NULL, direction ? d : NULL, &how,
+                                result ? &hit : NULL, NULL),
                      ctx);
         CHECK_TEXT("dist_trace: ", dist_context_message(ctx));
         CHECK_TEXT(part, dist_context_message(ctx));
@@ -998,7 +1016,7 @@ TEST(trace_refuses_what_it_cannot_trace)
     dist_context_destroy(ctx);
 }
 
-/* ---- the paper's tracer --------------------------------------------------------------------------------------------- */
+/* ---- the paper's tracer ----------------------------------------------------------------------------------------- */
 
 static dist_render_desc paper_how(int row, int steps)
 {
@@ -1024,8 +1042,8 @@ TEST(each_row_of_the_ladder_asks_less_than_the_one_before)
         CHECK(v.missed * 50 <= v.crossing);
         CHECK_EQUAL(0, v.phantom);
         if (test_state.verbose)
-            printf("    row %d: %llu queries, %d of %d missed, %d unresolved, worst %.1e\n", row, queries[row], v.missed, v.crossing,
-                   v.unresolved, v.worst);
+            printf("    row %d: %llu queries, %d of %d missed, %d unresolved, worst %.1e\n", row, queries[row],
+                   v.missed, v.crossing, v.unresolved, v.worst);
     }
     CHECK(queries[DIST_PAPER_PARALLEL] > queries[DIST_PAPER_DYNAMIC]);
     CHECK(queries[DIST_PAPER_DYNAMIC] > queries[DIST_PAPER_AGGRESSIVE]);
@@ -1089,7 +1107,7 @@ TEST(the_paper_converges_up_to_slope_1_2_and_not_from_1_34_on)
     dist_context_destroy(ctx);
 }
 
-/* ---- real decoders -------------------------------------------------------------------------------------------------- */
+/* ---- real decoders ---------------------------------------------------------------------------------------------- */
 
 static int order_doubles(const void *a, const void *b)
 {
@@ -1149,11 +1167,29 @@ static void compare_decoder(dist_context *ctx, const char *name, int size)
 
 TEST(depth_of_real_decoders_is_that_of_double)
 {
-    static const char *const names[] = {"bob_spot.0", "bob_spot.1", "bunny_relu", "chairs.1", "chairs.3", "deepsdf_512.0",
-                                        "deepsdf_512.2", "deepsdf_512.4", "deepsdf_512.8", "deepsdf_512_he.0", "fox",
-                                        "mug_camera_bottle.0", "mug_camera_bottle.1", "mug_camera_bottle.2", "primitives.7",
-                                        "primitives.13", "primitives.15", "primitives.29", "rings", "round_cross.0", "round_cross.10",
-                                        "spot_geometry.0", "two_spheres_sine"};
+    static const char *const names[] = {"bob_spot.0",
+                                        "bob_spot.1",
+                                        "bunny_relu",
+                                        "chairs.1",
+                                        "chairs.3",
+                                        "deepsdf_512.0",
+                                        "deepsdf_512.2",
+                                        "deepsdf_512.4",
+                                        "deepsdf_512.8",
+                                        "deepsdf_512_he.0",
+                                        "fox",
+                                        "mug_camera_bottle.0",
+                                        "mug_camera_bottle.1",
+                                        "mug_camera_bottle.2",
+                                        "primitives.7",
+                                        "primitives.13",
+                                        "primitives.15",
+                                        "primitives.29",
+                                        "rings",
+                                        "round_cross.0",
+                                        "round_cross.10",
+                                        "spot_geometry.0",
+                                        "two_spheres_sine"};
     FILE *probe = fopen(test_data_path("nets/fox.safetensors"), "rb");
     if (!probe) SKIP("no test data: set DIST_DATA");
     fclose(probe);

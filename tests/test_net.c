@@ -1,0 +1,1174 @@
+/* SPDX-License-Identifier: MIT-0
+   test_net.c - decoders: every form of the file, evaluated against double precision; folding, saving, making, refusing
+ */
+#include "test.h"
+
+#include "model.h"
+
+/* ---- help -------------------------------------------------------------------------------------------------------- */
+
+enum { POINTS = 70 };
+
+/* A model, the net loaded from its file, and a shape of it with a code. */
+typedef struct net_case {
+    const char *name;
+    model m;
+    dist_context *ctx;
+    dist_net *net;
+    dist_shape *shape;
+    dist_field field;
+    double code[MODEL_CODE];
+    float codef[MODEL_CODE];
+    float points[3 * POINTS];
+} net_case;
+
+static void case_close(net_case *c)
+{
+    dist_shape_destroy(c->shape);
+    dist_net_destroy(c->net);
+    dist_context_destroy(c->ctx);
+    model_free(&c->m);
+}
+
+static int case_open(net_case *c, int index)
+{
+    memset(c, 0, sizeof *c);
+    c->name = model_cases[index].name;
+    c->m = model_make(&model_cases[index], 100u + (unsigned)index);
+    c->ctx = test_context();
+    c->net = model_load(c->ctx, &c->m);
+    test_random random = test_random_seed(7u + (unsigned)index);
+    for (int j = 0; j < c->m.desc.code_size; j++) {
+        c->codef[j] = test_random_float(&random, -1.0f, 1.0f);
+        c->code[j] = (double)c->codef[j];
+    }
+    c->shape = dist_shape_create(c->ctx, c->net, c->codef);
+    c->field = dist_shape_field(c->shape);
+    test_random_fill(&random, 3 * POINTS, c->points, -1.0f, 1.0f);
+    if (!MODEL_CHECK(c->shape != NULL, c->name, dist_context_message(c->ctx), 1, 0)) {
+        case_close(c);
+        return 0;
+    }
+    return 1;
+}
+
+static void point_of(const net_case *c, int i, double p[3])
+{
+    for (int k = 0; k < 3; k++) p[k] = (double)c->points[3 * i + k];
+}
+
+/* Float rounding in front of sin(30 x) is magnified by 30. */
+static double value_tolerance(const model *m) { return m->desc.activation == DIST_ACTIVATION_SINE ? 2e-5 : 2e-6; }
+
+/* 10 h of the differences in model_gradient, as far as they move a pre-activation of these nets. */
+static const double kink = 1e-4;
+
+/* ---- values and gradients of every form -------------------------------------------------------------------------- */
+
+TEST(every_form_of_file_gives_the_values_that_the_format_says)
+{
+    for (int k = 0; k < MODEL_CASES; k++) {
+        net_case c;
+        float channels[4 * POINTS], sdf[POINTS];
+        double expected[4], worst = 0.0, p[3];
+        if (!case_open(&c, k)) continue;
+        CHECK_STATUS(DIST_OK, dist_shape_eval(c.ctx, c.shape, POINTS, c.points, channels), c.ctx);
+        if (c.m.sdf_channel >= 0)
+            CHECK_STATUS(DIST_OK, dist_field_eval(c.ctx, &c.field, POINTS, c.points, sdf, NULL), c.ctx);
+        for (int i = 0; i < POINTS; i++) {
+            point_of(&c, i, p);
+            model_channels(&c.m, c.m.params, c.code, p, expected, NULL, NULL);
+            for (int j = 0; j < c.m.channels; j++) {
+                double got = (double)channels[i * c.m.channels + j], size = fmax(1.0, fabs(expected[j]));
+                if (fabs(got - expected[j]) / size > worst) worst = fabs(got - expected[j]) / size;
+            }
+            if (c.m.sdf_channel >= 0)
+                MODEL_CHECK(memcmp(&sdf[i], &channels[i * c.m.channels + c.m.sdf_channel], sizeof(float)) == 0, c.name,
+                            "the field's value is the distance channel's", 0, (double)sdf[i]);
+        }
+        MODEL_CHECK(worst <= value_tolerance(&c.m), c.name, "largest error of a value", value_tolerance(&c.m), worst);
+        case_close(&c);
+    }
+}
+
+TEST(every_form_of_file_gives_point_gradients_that_match_differences)
+{
+    for (int k = 0; k < MODEL_CASES; k++) {
+        net_case c;
+        float sdf[POINTS], gradient[3 * POINTS];
+        double expected[3 * POINTS], closest, p[3], largest = 0.0, worst = 0.0;
+        int excluded = 0, use[POINTS];
+        if (!case_open(&c, k)) continue;
+        if (c.m.sdf_channel < 0) {
+            case_close(&c);
+            continue;
+        }
+        CHECK_STATUS(DIST_OK, dist_field_eval(c.ctx, &c.field, POINTS, c.points, sdf, gradient), c.ctx);
+        for (int i = 0; i < POINTS; i++) {
+            point_of(&c, i, p);
+            model_channels(&c.m, c.m.params, c.code, p, NULL, NULL, &closest);
+            use[i] = closest > kink;
+            excluded += !use[i];
+            model_gradient(&c.m, c.m.params, c.code, p, expected + 3 * i);
+            for (int j = 0; j < 3; j++) largest = fmax(largest, fabs(expected[3 * i + j]));
+        }
+        for (int i = 0; i < 3 * POINTS; i++)
+            if (use[i / 3]) worst = fmax(worst, fabs((double)gradient[i] - expected[i]) / largest);
+        MODEL_CHECK(worst <= 1e-4, c.name, "largest relative error of a gradient", 1e-4, worst);
+        MODEL_CHECK(10 * excluded <= POINTS, c.name, "points near kinks", POINTS / 10.0, excluded);
+        case_close(&c);
+    }
+}
+
+TEST(every_form_of_file_gives_code_gradients_that_match_differences)
+{
+    for (int k = 0; k < MODEL_CASES; k++) {
+        net_case c;
+        double closest, p[3], error = 0.0, size = 0.0, code[MODEL_CODE];
+        int excluded = 0, n = model_cases[k].code_size;
+        float one = 1.0f;
+        const double h = 1e-6;
+        if (n == 0) continue;
+        if (!case_open(&c, k)) continue;
+        for (int i = 0; i < POINTS && c.m.sdf_channel >= 0; i++) {
+            float d_code[MODEL_CODE] = {0};
+            dist_gradients grads;
+            memset(&grads, 0, sizeof grads);
+            grads.code = d_code;
+            point_of(&c, i, p);
+            model_channels(&c.m, c.m.params, c.code, p, NULL, NULL, &closest);
+            excluded += closest <= kink;
+            if (closest <= kink) continue;
+            CHECK_STATUS(DIST_OK,
+                         dist_field_backward(c.ctx, &c.field, 1, c.points + 3 * i, &one, NULL, NULL, NULL, &grads),
+                         c.ctx);
+            memcpy(code, c.code, sizeof code);
+            for (int j = 0; j < n; j++) {
+                code[j] = c.code[j] + h;
+                double expected = model_eval(&c.m, c.m.params, code, p);
+                code[j] = c.code[j] - h;
+                expected = (expected - model_eval(&c.m, c.m.params, code, p)) / (2.0 * h);
+                code[j] = c.code[j];
+                error = fmax(error, fabs((double)d_code[j] - expected));
+                size = fmax(size, fabs(expected));
+            }
+        }
+        MODEL_CHECK(error <= 1e-4 * size, c.name, "largest error of a code gradient", 1e-4 * size, error);
+        MODEL_CHECK(10 * excluded <= POINTS, c.name, "points near kinks", POINTS / 10.0, excluded);
+        case_close(&c);
+    }
+}
+
+TEST(what_the_file_says_of_code_channels_bound_and_clamp_is_what_the_net_tells)
+{
+    for (int k = 0; k < MODEL_CASES; k++) {
+        net_case c;
+        if (!case_open(&c, k)) continue;
+        const model_desc *d = &c.m.desc;
+        CHECK_EQUAL(d->code_size, dist_net_code_size(c.net));
+        CHECK_EQUAL(d->code_count, dist_net_code_count(c.net));
+        CHECK_EQUAL(c.m.channels, dist_net_channels(c.net));
+        CHECK_NEAR(d->bound > 0.0 ? d->bound : 1.0, dist_net_bound(c.net), 1e-7);
+        CHECK_NEAR(d->bound > 0.0 ? d->bound : 1.0, c.field.radius, 1e-7);
+        CHECK_NEAR(d->clamp > 0.0 ? d->clamp : d->code_size ? 0.1 : 0.0, c.field.clamp, 1e-7);
+        CHECK_EQUAL(d->code_size, c.field.code_size);
+        CHECK_EQUAL(c.m.count, dist_net_weight_count(c.net));
+        CHECK_EQUAL(c.m.sdf_channel >= 0 ? c.m.count : 0, c.field.weight_count);
+        CHECK((c.field.color_fn != NULL) == (d->channels && strstr(d->channels, "r,g,b") != NULL));
+        CHECK((c.field.eval_fn != NULL) == (c.m.sdf_channel >= 0));
+        for (int i = 0; i < d->code_count * d->code_size; i++)
+            CHECK_NEAR(c.m.codes[i], dist_net_code(c.net, i / d->code_size)[i % d->code_size], 0.0);
+        CHECK(dist_net_code(c.net, d->code_count) == NULL && dist_net_code(c.net, -1) == NULL);
+        const float *weights = dist_net_weights(c.net);
+        for (size_t i = 0; i < c.m.count; i++) CHECK_NEAR(c.m.params[i], weights[i], d->spelling ? 1e-6 : 0.0);
+        case_close(&c);
+    }
+}
+
+TEST(color_is_the_three_channels_behind_one_another)
+{
+    for (int k = 0; k < MODEL_CASES; k++) {
+        net_case c;
+        float channels[4 * POINTS], color[3 * POINTS];
+        const char *names = model_cases[k].channels, *first = names ? strstr(names, "r,g,b") : NULL;
+        if (!first) continue;
+        if (!case_open(&c, k)) continue;
+        size_t at = first == names ? 0 : 1;
+        dist_shape_eval(c.ctx, c.shape, POINTS, c.points, channels);
+        c.field.color_fn(c.field.user, 0, POINTS, c.points, color);
+        for (size_t i = 0; i < POINTS; i++)
+            CHECK_BYTES(3 * sizeof(float), channels + i * (size_t)c.m.channels + at, color + 3 * i);
+        case_close(&c);
+    }
+}
+
+/* ---- folding, batches, dead units -------------------------------------------------------------------------------- */
+
+TEST(a_code_folded_by_hand_gives_the_same_values)
+{
+    for (int k = 0; k < MODEL_CASES; k++) {
+        net_case c;
+        model folded;
+        model_desc desc = model_cases[k];
+        float a[4 * POINTS], b[4 * POINTS];
+        if (desc.code_size == 0) continue;
+        if (!case_open(&c, k)) continue;
+        desc.code_size = desc.code_count = 0;
+        desc.spelling = desc.dtype = 0;
+        desc.clamp = 0.1;
+        folded = model_make(&desc, 1);
+        for (int l = 0; l < c.m.layers; l++) { /* copy all columns but the code's, which go to the bias */
+            int in = c.m.in[l], small = folded.in[l], sees = model_sees_input(&c.m, l);
+            int before = l && !desc.skip_input_first ? c.m.out[l - 1] : 0;
+            int first = before + (desc.point_first ? c.m.point_size : 0);
+            double scale = l && desc.skip_scale > 0.0 ? desc.skip_scale : 1.0;
+            const double *from = c.m.params + c.m.offset[l];
+            double *to = folded.params + folded.offset[l];
+            memcpy(to + small * c.m.out[l], from + in * c.m.out[l],
+                   (size_t)c.m.out[l] * (model_is_normed(&c.m, l) ? 3u : 1u) * sizeof(double));
+            for (int o = 0; o < c.m.out[l]; o++) {
+                double sum = 0.0;
+                for (int j = 0, at = 0; j < in; j++) {
+                    int is_code = sees && j >= first && j < first + c.m.desc.code_size;
+                    if (is_code)
+                        sum += scale * from[o * in + j] * c.code[j - first];
+                    else
+                        to[o * small + at++] = from[o * in + j];
+                }
+                to[small * c.m.out[l] + o] += sum;
+            }
+        }
+        dist_net *net = model_load(c.ctx, &folded);
+        dist_shape *shape = dist_shape_create(c.ctx, net, NULL);
+        CHECK_STATUS(DIST_OK, dist_shape_eval(c.ctx, c.shape, POINTS, c.points, a), c.ctx);
+        CHECK_STATUS(DIST_OK, dist_shape_eval(c.ctx, shape, POINTS, c.points, b), c.ctx);
+        CHECK_NEAR_ARRAY((size_t)(POINTS * c.m.channels), b, a, 1e-6);
+        CHECK_EQUAL(dist_net_operations(net, 0), dist_net_operations(c.net, 1));
+        CHECK(dist_net_operations(c.net, 0) > dist_net_operations(c.net, 1));
+        dist_shape_destroy(shape);
+        dist_net_destroy(net);
+        model_free(&folded);
+        case_close(&c);
+    }
+}
+
+TEST(setting_a_code_equals_making_the_shape_with_it)
+{
+    for (int k = 0; k < MODEL_CASES; k++) {
+        net_case c;
+        float a[4 * POINTS], b[4 * POINTS];
+        if (model_cases[k].code_size == 0) continue;
+        if (!case_open(&c, k)) continue;
+        dist_shape *shape = dist_shape_create(c.ctx, c.net, NULL);
+        dist_shape_eval(c.ctx, c.shape, POINTS, c.points, a);
+        CHECK_STATUS(DIST_OK, dist_shape_set_code(shape, c.codef), c.ctx);
+        dist_shape_eval(c.ctx, shape, POINTS, c.points, b);
+        CHECK_BYTES((size_t)(POINTS * c.m.channels) * sizeof(float), a, b);
+        dist_shape_destroy(shape);
+        case_close(&c);
+    }
+}
+
+TEST(operations_of_a_net_are_its_multiply_adds)
+{
+    model_desc desc = {.hidden = 2, .width = 10, .skip = 4, .code_size = 4};
+    model m = model_make(&desc, 3);
+    dist_context *ctx = test_context();
+    dist_net *net = model_load(ctx, &m);
+    /* 7 -> 10 -> 13 -> 1, the input again in front of the last */
+    CHECK_EQUAL(10 * 7 + 13 * 10 + (13 + 7), dist_net_operations(net, 0));
+    CHECK_EQUAL(10 * 3 + 13 * 10 + (13 + 3), dist_net_operations(net, 1));
+    dist_net_destroy(net);
+    dist_context_destroy(ctx);
+    model_free(&m);
+}
+
+TEST(a_point_has_the_same_bits_in_every_batch)
+{
+    for (int k = 0; k < MODEL_CASES; k++) {
+        enum { MOST = 100 };
+        net_case c;
+        float points[3 * MOST], sdf[MOST], gradient[3 * MOST], a[MOST], g[3 * MOST];
+        if (model_cases[k].channels) continue;
+        if (!case_open(&c, k)) continue;
+        test_random random = test_random_seed(5);
+        test_random_fill(&random, 3 * MOST, points, -1.0f, 1.0f);
+        dist_field_eval(c.ctx, &c.field, MOST, points, sdf, gradient);
+        for (size_t n = 1; n <= MOST; n += test_quick() ? 7 : 1) {
+            size_t first = n * 37 % (MOST + 1 - n); /* another place in the block, too */
+            dist_field_eval(c.ctx, &c.field, n, points + 3 * first, a, n % 3 ? g : NULL);
+            MODEL_CHECK(memcmp(sdf + first, a, n * sizeof(float)) == 0, c.name, "same values in a batch of", 0,
+                        (double)n);
+            if (n % 3)
+                MODEL_CHECK(memcmp(gradient + 3 * first, g, 3 * n * sizeof(float)) == 0, c.name,
+                            "same gradients in a batch of", 0, (double)n);
+        }
+        case_close(&c);
+    }
+}
+
+TEST(a_dead_unit_that_is_left_out_changes_no_bit)
+{
+    for (int normed = 0; normed < 2; normed++) {
+        model_desc desc = {.hidden = 4, .width = 40, .skip = 4, .code_size = 3, .normed = normed};
+        model dead = model_make(&desc, 11), alive = model_make(&desc, 11);
+        dist_context *ctx = test_context();
+        float points[3 * POINTS], sdf[2][POINTS], gradient[2][3 * POINTS];
+        test_random random = test_random_seed(2);
+        test_random_fill(&random, 3 * POINTS, points, -1.0f, 1.0f);
+        for (int l = 0; l + 1 < dead.layers; l++) {
+            size_t in = (size_t)dead.in[l], out = (size_t)dead.out[l], next = (size_t)dead.in[l + 1];
+            double *bias[2] = {dead.params + dead.offset[l] + in * out, alive.params + alive.offset[l] + in * out};
+            for (size_t o = 0; o < out; o++) {
+                if (test_random_int(&random, 0, 2) > 0) continue;
+                /* one never fires; the other does, and nobody listens: gamma 0 makes both the same with a norm */
+                for (int i = 0; i < 2; i++) {
+                    if (normed) bias[i][out + o] = 0.0;
+                    bias[i][(normed ? 2 * out : 0) + o] = i ? 9.0 : -9.0;
+                }
+                for (size_t u = 0; u < (size_t)alive.out[l + 1]; u++)
+                    alive.params[alive.offset[l + 1] + u * next + o] = 0.0;
+            }
+        }
+        double done[2] = {0, 0};
+        for (int i = 0; i < 2; i++) {
+            dist_net *net = model_load(ctx, i ? &alive : &dead);
+            dist_shape *shape = dist_shape_create(ctx, net, NULL);
+            dist_field field = dist_shape_field(shape);
+            float eye[3] = {0, 0, 3}, at[3] = {0, 0, 0}, up[3] = {0, 1, 0};
+            dist_camera camera = dist_camera_look_at(8, 8, 0.6f, eye, at, up);
+            dist_images out;
+            dist_stats stats;
+            CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &field, POINTS, points, sdf[i], gradient[i]), ctx);
+            memset(&out, 0, sizeof out);
+            memset(&stats, 0, sizeof stats);
+            out.stats = &stats;
+            CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, NULL), ctx);
+            done[i] = stats.operations > 0.0 ? stats.operations_done / stats.operations : -1.0;
+            dist_shape_destroy(shape);
+            dist_net_destroy(net);
+        }
+        if (normed) { /* the norm sees the biased units: with gamma 0 only their outputs differ */
+            CHECK_BYTES(sizeof sdf[0], sdf[1], sdf[0]);
+        } else {
+            CHECK_BYTES(sizeof sdf[0], sdf[1], sdf[0]);
+            CHECK_BYTES(sizeof gradient[0], gradient[1], gradient[0]);
+        }
+        CHECK(done[0] > 0.0 && done[0] < 0.95 * done[1]);
+        model_free(&dead);
+        model_free(&alive);
+        dist_context_destroy(ctx);
+    }
+}
+
+/* ---- saving ------------------------------------------------------------------------------------------------------ */
+
+static unsigned char *saved(dist_context *ctx, const dist_net *net, size_t *size)
+{
+    unsigned char *bytes = NULL;
+    if (CHECK_STATUS(DIST_OK, dist_net_save(ctx, net, NULL, 0, size), ctx)) bytes = (unsigned char *)malloc(*size);
+    if (bytes) CHECK_STATUS(DIST_OK, dist_net_save(ctx, net, bytes, *size, size), ctx);
+    return bytes;
+}
+
+TEST(a_saved_net_loads_and_saves_to_the_same_bytes_and_values)
+{
+    for (int k = 0; k < MODEL_CASES; k++) {
+        net_case c;
+        size_t size[2];
+        float a[4 * POINTS], b[4 * POINTS];
+        if (!case_open(&c, k)) continue;
+        unsigned char *first = saved(c.ctx, c.net, &size[0]);
+        dist_net *net = first ? dist_net_load(c.ctx, first, size[0]) : NULL;
+        dist_shape *shape = dist_shape_create(c.ctx, net, c.codef);
+        unsigned char *second = net ? saved(c.ctx, net, &size[1]) : NULL;
+        MODEL_CHECK(shape && second && size[0] == size[1] && memcmp(first, second, size[0]) == 0, c.name,
+                    dist_context_message(c.ctx), 0, 0);
+        if (shape) {
+            dist_shape_eval(c.ctx, c.shape, POINTS, c.points, a);
+            dist_shape_eval(c.ctx, shape, POINTS, c.points, b);
+            MODEL_CHECK(memcmp(a, b, (size_t)(POINTS * c.m.channels) * sizeof(float)) == 0, c.name, "same values", 0,
+                        0);
+            dist_field field = dist_shape_field(shape);
+            CHECK_NEAR(c.field.clamp, field.clamp, 0.0);
+            CHECK_NEAR(c.field.radius, field.radius, 0.0);
+            CHECK_EQUAL(dist_net_code_count(c.net), dist_net_code_count(net));
+        }
+        dist_shape_destroy(shape);
+        dist_net_destroy(net);
+        free(first);
+        free(second);
+        case_close(&c);
+    }
+}
+
+TEST(saving_into_too_small_a_buffer_is_refused)
+{
+    net_case c;
+    size_t size = 0, again = 0;
+    REQUIRE(case_open(&c, 0));
+    unsigned char *bytes = saved(c.ctx, c.net, &size);
+    REQUIRE(bytes != NULL);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_net_save(c.ctx, c.net, bytes, size - 1, &again), c.ctx);
+    CHECK_EQUAL(size, again);
+    free(bytes);
+    case_close(&c);
+}
+
+TEST(a_net_saved_to_a_file_is_loaded_from_it)
+{
+    net_case c;
+    size_t size[2];
+    REQUIRE(case_open(&c, 11));
+    const char *path = test_temp_path("test_net.safetensors");
+    if (dist_net_save_file(c.ctx, c.net, path) == DIST_IO) {
+        case_close(&c);
+        SKIP("the folder for temporary files is not there");
+    }
+    dist_net *net = dist_net_load_file(c.ctx, path);
+    CHECK_STATUS(DIST_OK, dist_context_status(c.ctx), c.ctx);
+    unsigned char *a = saved(c.ctx, c.net, &size[0]), *b = saved(c.ctx, net, &size[1]);
+    REQUIRE(a && b);
+    CHECK_EQUAL(size[0], size[1]);
+    CHECK_BYTES(size[0], a, b);
+    remove(path);
+    CHECK(dist_net_load_file(c.ctx, path) == NULL);
+    CHECK_STATUS(DIST_IO, dist_context_status(c.ctx), c.ctx);
+    free(a);
+    free(b);
+    dist_net_destroy(net);
+    case_close(&c);
+}
+
+/* ---- making ------------------------------------------------------------------------------------------------------ */
+
+static dist_net_desc small_desc(void)
+{
+    dist_net_desc d;
+    memset(&d, 0, sizeof d);
+    d.layers = 4;
+    d.width = 48;
+    d.skip = 2;
+    d.code_size = 5;
+    d.code_count = 3;
+    return d;
+}
+
+TEST(a_geometric_start_is_near_the_distance_to_a_sphere_of_half_the_bound)
+{
+    static const int activations[2] = {DIST_ACTIVATION_RELU, DIST_ACTIVATION_SOFTPLUS};
+    static const float bounds[2] = {1.0f, 2.0f};
+    for (int k = 0; k < 4; k++) {
+        enum { N = 200 };
+        dist_context *ctx = test_context();
+        dist_net_desc d = small_desc();
+        float points[3 * N], sdf[N], code[5] = {1, -1, 0.5f, 2, 0};
+        double mean = 0.0, worst = 0.0;
+        d.width = 256;
+        d.activation = activations[k / 2];
+        d.bound = bounds[k % 2];
+        d.geometric = d.output_linear = 1;
+        dist_net *net = dist_net_create(ctx, &d);
+        dist_shape *shape = dist_shape_create(ctx, net, code);
+        dist_field field = dist_shape_field(shape);
+        test_random random = test_random_seed(1);
+        test_random_fill(&random, 3 * N, points, -d.bound, d.bound);
+        CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &field, N, points, sdf, NULL), ctx);
+        for (int i = 0; i < N; i++) {
+            const float *p = points + 3 * i;
+            double r = sqrt((double)p[0] * (double)p[0] + (double)p[1] * (double)p[1] + (double)p[2] * (double)p[2]);
+            double error = fabs((double)sdf[i] - (r - 0.5 * (double)d.bound)) / (double)d.bound;
+            mean += error / N;
+            worst = fmax(worst, error);
+        }
+        CHECK_NEAR(0.0, mean, 0.15);
+        CHECK_NEAR(0.0, worst, 0.4);
+        CHECK_NEAR(d.bound, field.radius, 0.0);
+        dist_shape_destroy(shape);
+        dist_net_destroy(net);
+        dist_context_destroy(ctx);
+    }
+}
+
+TEST(a_seed_gives_the_same_net_and_another_seed_another)
+{
+    dist_context *ctx = test_context();
+    dist_net_desc d = small_desc();
+    for (int geometric = 0; geometric < 2; geometric++) {
+        d.geometric = geometric;
+        d.seed = 5;
+        dist_net *a = dist_net_create(ctx, &d), *b = dist_net_create(ctx, &d);
+        d.seed = 6;
+        dist_net *other = dist_net_create(ctx, &d);
+        size_t n = dist_net_weight_count(a);
+        REQUIRE(a && b && other);
+        CHECK_BYTES(n * sizeof(float), dist_net_weights(a), dist_net_weights(b));
+        CHECK(memcmp(dist_net_weights(a), dist_net_weights(other), n * sizeof(float)) != 0);
+        dist_net_destroy(a);
+        dist_net_destroy(b);
+        dist_net_destroy(other);
+    }
+    dist_context_destroy(ctx);
+}
+
+TEST(a_net_made_has_the_form_asked_for)
+{
+    dist_context *ctx = test_context();
+    dist_net_desc d = small_desc();
+    d.clamp = 0.25f;
+    dist_net *net = dist_net_create(ctx, &d);
+    dist_shape *shape = dist_shape_create(ctx, net, NULL);
+    CHECK_EQUAL(5, dist_net_code_size(net));
+    CHECK_EQUAL(3, dist_net_code_count(net));
+    CHECK_EQUAL(1, dist_net_channels(net));
+    CHECK_EQUAL(9 * 48 + 49 * 48 + 57 * 48 + 49 * 48 + 49, dist_net_weight_count(net));
+    CHECK_NEAR(0.25, dist_shape_field(shape).clamp, 1e-7);
+    for (int i = 0; i < 15; i++) CHECK_NEAR(0.0, dist_net_code(net, i / 5)[i % 5], 0.0);
+    /* PyTorch's start is uniform within 1 / sqrt(in) */
+    float largest = 0.0f;
+    for (int i = 0; i < 8 * 48; i++) largest = fmaxf(largest, fabsf(dist_net_weights(net)[i]));
+    CHECK(largest <= 0.35356f && largest > 0.33f);
+    dist_shape_destroy(shape);
+    dist_net_destroy(net);
+    dist_context_destroy(ctx);
+}
+
+TEST(a_net_that_cannot_be_made_is_refused)
+{
+    for (int k = 0; k < 9; k++) {
+        dist_context *ctx = test_context();
+        dist_net_desc d = small_desc();
+        switch (k) {
+        case 0: d.layers = 32; break;
+        case 1: d.width = 4097; break;
+        case 2: d.skip = 4; break;
+        case 3: d.skip = -1; break;
+        case 4: d.code_size = -1; break;
+        case 5: d.activation = 6; break;
+        case 6: d.scale = -1.0f; break;
+        case 7: d.bound = -1.0f; break;
+        default: d.layers = -1; break;
+        }
+        CHECK(dist_net_create(ctx, &d) == NULL);
+        CHECK_STATUS(DIST_BAD_ARGUMENT, dist_context_status(ctx), ctx);
+        CHECK_TEXT("dist_net_create: ", dist_context_message(ctx));
+        dist_context_destroy(ctx);
+    }
+}
+
+TEST(set_weights_makes_one_net_the_other)
+{
+    dist_context *ctx = test_context();
+    dist_net_desc d = small_desc();
+    float a[POINTS], b[POINTS], points[3 * POINTS], code[5] = {0.5f, -1, 2, 0.25f, 1};
+    test_random random = test_random_seed(4);
+    test_random_fill(&random, 3 * POINTS, points, -1.0f, 1.0f);
+    dist_net *net = dist_net_create(ctx, &d);
+    d.seed = 9;
+    dist_net *other = dist_net_create(ctx, &d);
+    dist_shape *shape = dist_shape_create(ctx, net, code), *expected = dist_shape_create(ctx, other, code);
+    CHECK_STATUS(DIST_OK, dist_net_set_weights(ctx, net, dist_net_weights(other)), ctx);
+    CHECK_STATUS(DIST_OK, dist_shape_set_code(shape, code), ctx);
+    dist_shape_eval(ctx, shape, POINTS, points, a);
+    dist_shape_eval(ctx, expected, POINTS, points, b);
+    CHECK_BYTES(sizeof a, b, a);
+    CHECK_STATUS(DIST_OK, dist_net_set_code(ctx, net, 2, code), ctx);
+    CHECK_BYTES(sizeof code, code, dist_net_code(net, 2));
+    for (int i = 0; i < 10; i++) CHECK_NEAR(0.0, dist_net_code(net, i / 5)[i % 5], 0.0);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_net_set_code(ctx, net, 3, code), ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_net_set_code(ctx, net, -1, code), ctx);
+    dist_shape_destroy(shape);
+    dist_shape_destroy(expected);
+    dist_net_destroy(net);
+    dist_net_destroy(other);
+    dist_context_destroy(ctx);
+}
+
+static float not_a_number(void)
+{
+    uint32_t bits = 0x7fc00000u;
+    float x;
+    memcpy(&x, &bits, sizeof x);
+    return x;
+}
+
+TEST(numbers_that_are_not_finite_are_refused_and_change_nothing)
+{
+    dist_context *ctx = test_context();
+    dist_net_desc d = small_desc();
+    dist_net *net = dist_net_create(ctx, &d);
+    size_t n = dist_net_weight_count(net);
+    float *weights = (float *)malloc(n * sizeof(float)), code[5] = {0}, before, after, p[3] = {0.1f, 0.2f, 0.3f};
+    dist_shape *shape = dist_shape_create(ctx, net, NULL);
+    REQUIRE(weights && shape);
+    dist_shape_eval(ctx, shape, 1, p, &before);
+    memcpy(weights, dist_net_weights(net), n * sizeof(float));
+    for (size_t i = 0; i + 1 < n; i++) weights[i] = 1.0f;
+    weights[n - 1] = code[4] = not_a_number();
+    CHECK_STATUS(DIST_NOT_FINITE, dist_net_set_weights(ctx, net, weights), ctx);
+    CHECK_STATUS(DIST_NOT_FINITE, dist_net_set_code(ctx, net, 0, code), ctx);
+    CHECK_STATUS(DIST_NOT_FINITE, dist_shape_set_code(shape, code), ctx);
+    CHECK(dist_shape_create(ctx, net, code) == NULL);
+    dist_context_clear(ctx);
+    CHECK_STATUS(DIST_OK, dist_shape_set_code(shape, NULL), ctx);
+    dist_shape_eval(ctx, shape, 1, p, &after);
+    CHECK_BYTES(sizeof before, &before, &after);
+    free(weights);
+    dist_shape_destroy(shape);
+    dist_net_destroy(net);
+    dist_context_destroy(ctx);
+}
+
+/* ---- refusing ---------------------------------------------------------------------------------------------------- */
+
+static const char *const good_tensors =
+    "lin0.weight 4 5;lin0.bias 4;lin1.weight 4 4;lin1.bias 4;lin2.weight 1 4;lin2.bias 1;";
+
+/* A file of these tensors, all its numbers 0.25 but the one at place `bad`, which is `value`. */
+static unsigned char *file_of(const char *meta, const char *tensors, const char *type, int bad, float value,
+                              size_t *size)
+{
+    static char header[8192];
+    size_t at = 0, numbers = 0, length = 0, width = strcmp(type, "F32") == 0 ? 4 : strcmp(type, "F64") == 0 ? 8 : 2;
+    length += (size_t)snprintf(header, sizeof header, "{\"__metadata__\":{%s}", meta);
+    for (; tensors[at]; at++) {
+        char name[64];
+        long shape[2] = {1, 1};
+        int rank = 0;
+        size_t n = strcspn(tensors + at, " ");
+        memcpy(name, tensors + at, n);
+        name[n] = 0;
+        for (at += n; tensors[at] == ' '; at += strcspn(tensors + at, " ;"))
+            shape[rank++] = strtol(tensors + ++at, NULL, 10);
+        size_t count = (size_t)(shape[0] * shape[1]);
+        length += (size_t)snprintf(header + length, sizeof header - length,
+                                   rank == 2 ? ",\"%s\":{\"dtype\":\"%s\",\"shape\":[%ld,%ld],"
+                                             : ",\"%s\":{\"dtype\":\"%s\",\"shape\":[%ld],",
+                                   name, type, shape[0], shape[1]);
+        length += (size_t)snprintf(header + length, sizeof header - length, "\"data_offsets\":[%lu,%lu]}",
+                                   (unsigned long)(numbers * width), (unsigned long)((numbers + count) * width));
+        numbers += count;
+    }
+    length += (size_t)snprintf(header + length, sizeof header - length, "}");
+    *size = 8 + length + numbers * width;
+    unsigned char *bytes = (unsigned char *)calloc(1, *size);
+    if (!bytes) exit(1);
+    for (size_t i = 0; i < 8; i++) bytes[i] = (unsigned char)((uint64_t)length >> 8 * i);
+    memcpy(bytes + 8, header, length);
+    for (size_t i = 0; i < numbers && width == 4; i++) {
+        float x = (int)i == bad ? value : 0.25f;
+        memcpy(bytes + 8 + length + 4 * i, &x, sizeof x);
+    }
+    return bytes;
+}
+
+static void refused(dist_status expected, const char *part, const char *meta, const char *tensors, const char *type,
+                    int bad, float value, const char *file, int line)
+{
+    test_allocator a;
+    dist_context_desc desc = test_context_desc();
+    size_t size;
+    memset(&a, 0, sizeof a);
+    desc.workers = 1;
+    desc.allocator = test_allocator_hook(&a);
+    dist_context *ctx = dist_context_create(&desc);
+    size_t before = a.live_blocks;
+    unsigned char *bytes = file_of(meta, tensors, type, bad, value, &size);
+    dist_net *net = dist_net_load(ctx, bytes, size);
+    model_check(net == NULL && dist_context_status(ctx) == expected && strstr(dist_context_message(ctx), part) &&
+                    strncmp(dist_context_message(ctx), "dist_net_load: ", 15) == 0,
+                meta[0] ? meta : tensors, dist_context_message(ctx), expected, dist_context_status(ctx), file, line);
+    dist_net_destroy(net);
+    free(bytes);
+    CHECK_EQUAL(before, a.live_blocks);
+    dist_context_destroy(ctx);
+    CHECK_EQUAL(0, a.live_blocks);
+}
+
+TEST(the_file_that_the_wrong_ones_are_made_of_is_right)
+{
+    dist_context *ctx = test_context();
+    size_t size;
+    unsigned char *bytes = file_of("", good_tensors, "F32", -1, 0.0f, &size);
+    dist_net *net = dist_net_load(ctx, bytes, size);
+    CHECK_STATUS(DIST_OK, dist_context_status(ctx), ctx);
+    CHECK_EQUAL(2, dist_net_code_size(net));
+    free(bytes);
+    dist_net_destroy(net);
+    dist_context_destroy(ctx);
+}
+
+#define REFUSED(status, part, meta, tensors) refused(status, part, meta, tensors, "F32", -1, 0.0f, __FILE__, __LINE__)
+
+TEST(tensors_that_do_not_fit_are_refused_with_a_sentence)
+{
+    REFUSED(DIST_BAD_FILE, "bias", "", "lin0.weight 4 5;lin0.bias 4;lin1.weight 1 4;");
+    REFUSED(DIST_BAD_FILE, "bias", "", "lin0.weight 4 5;lin1.weight 1 4;lin1.bias 1;");
+    REFUSED(DIST_BAD_FILE, "lin0.bias has 3 numbers, must have 4", "",
+            "lin0.weight 4 5;lin0.bias 3;lin1.weight 1 4;lin1.bias 1;");
+    REFUSED(DIST_BAD_FILE, "6 wide", "", "lin0.weight 4 5;lin0.bias 4;lin1.weight 1 6;lin1.bias 1;");
+    REFUSED(DIST_BAD_FILE, "(out, in)", "", "lin0.weight 20;lin0.bias 4;");
+    REFUSED(DIST_BAD_FILE, "no tensor is called lin0.weight", "", "layer.weight 4 5;");
+    REFUSED(DIST_BAD_FILE, "lin", "", "lin0.weight 4 2;lin0.bias 4;lin1.weight 1 4;lin1.bias 1;");
+    REFUSED(DIST_BAD_FILE, "dist.channels", "", "lin0.weight 4 5;lin0.bias 4;lin1.weight 2 4;lin1.bias 2;");
+    REFUSED(DIST_BAD_FILE, "lin0.weight_g has 3", "",
+            "lin0.weight_g 3 1;lin0.weight_v 4 5;lin0.bias 4;lin1.weight 1 4;lin1.bias 1;");
+    REFUSED(DIST_BAD_FILE, "no tensor is called", "", "lin0.weight_g 4 1;lin0.bias 4;lin1.weight 1 4;lin1.bias 1;");
+    REFUSED(DIST_BAD_FILE, "norm weight", "\"dist.norm\":\"layer\"", good_tensors);
+    REFUSED(DIST_BAD_FILE, "codes must be (n, 2)", "",
+            "lin0.weight 4 5;lin0.bias 4;lin1.weight 1 4;lin1.bias 1;codes 2 3;");
+    REFUSED(DIST_BAD_FILE, "codes must be (n, 2)", "",
+            "lin0.weight 4 5;lin0.bias 4;lin1.weight 1 4;lin1.bias 1;codes 4;");
+}
+
+/* A hole between the layers would silently drop the rest. */
+TEST(a_layer_missing_in_the_middle_is_refused)
+{
+    REFUSED(DIST_BAD_FILE, "", "",
+            "lin0.weight 4 5;lin0.bias 4;lin1.weight 1 4;lin1.bias 1;lin3.weight 1 1;lin3.bias 1;");
+}
+
+TEST(metadata_that_means_nothing_is_refused_with_a_sentence)
+{
+    static const char *const wrong[][2] = {{"dist.activation", "gelu"},
+                                           {"dist.activation", "relu:2"},
+                                           {"dist.activation", "softplus:"},
+                                           {"dist.activation", "softplus:-1"},
+                                           {"dist.activation", "softplus:1,2"},
+                                           {"dist.activation", "sine:30,"},
+                                           {"dist.activation", "sine:1e300"},
+                                           {"dist.activation", "sine:nan"},
+                                           {"dist.activation", ""},
+                                           {"dist.output", "relu"},
+                                           {"dist.output", "tanh:3"},
+                                           {"dist.input", "xyz"},
+                                           {"dist.skip", "3"},
+                                           {"dist.skip", "0"},
+                                           {"dist.skip", "1;2"},
+                                           {"dist.skip", "-1"},
+                                           {"dist.skip", "x"},
+                                           {"dist.skip_order", "input"},
+                                           {"dist.skip_scale", "0"},
+                                           {"dist.skip_scale", "-1"},
+                                           {"dist.encoding", "hash"},
+                                           {"dist.encoding.levels", "1.5"},
+                                           {"dist.encoding.levels", "17"},
+                                           {"dist.encoding.levels", "-1"},
+                                           {"dist.encoding.raw", "2"},
+                                           {"dist.encoding.raw", "0.5"},
+                                           {"dist.encoding.base", "0"},
+                                           {"dist.encoding.order", "cos,sin"},
+                                           {"dist.norm", "batch"},
+                                           {"dist.norm.epsilon", "-1"},
+                                           {"dist.level", "inf"},
+                                           {"dist.level", "1 "},
+                                           {"dist.bound", "0"},
+                                           {"dist.bound", "-1"},
+                                           {"dist.clamp", "-1"},
+                                           {"dist.clamp", "abc"},
+                                           {"dist.channels", ""},
+                                           {"dist.channels", ",sdf"},
+                                           {"dist.channels", "sdf,"},
+                                           {"dist.code_size", "two"}};
+    for (size_t k = 0; k < sizeof wrong / sizeof wrong[0]; k++) {
+        char meta[128];
+        snprintf(meta, sizeof meta, "\"%s\":\"%s\"", wrong[k][0], wrong[k][1]);
+        REFUSED(DIST_BAD_FILE, wrong[k][0], meta, good_tensors);
+    }
+    REFUSED(DIST_BAD_FILE, "layer 0 takes 5", "\"dist.code_size\":\"3\"", good_tensors);
+    REFUSED(DIST_BAD_FILE, "4 wide", "\"dist.skip\":\"1\"", good_tensors);
+    REFUSED(DIST_BAD_FILE, "dist.encoding.levels", "\"dist.encoding\":\"fourier\",\"dist.encoding.raw\":\"0\"",
+            good_tensors);
+}
+
+TEST(weights_that_are_not_finite_and_unknown_types_are_refused)
+{
+    refused(DIST_NOT_FINITE, "lin0.weight holds", "", good_tensors, "F32", 3, not_a_number(), __FILE__, __LINE__);
+    refused(DIST_NOT_FINITE, "lin2.bias holds", "", good_tensors, "F32", 48, not_a_number(), __FILE__, __LINE__);
+    refused(DIST_NOT_FINITE, "codes holds", "", "lin0.weight 1 5;lin0.bias 1;codes 1 2;", "F32", 7, not_a_number(),
+            __FILE__, __LINE__);
+    refused(DIST_UNSUPPORTED, "must be F32, F16 or BF16", "", good_tensors, "F64", -1, 0.0f, __FILE__, __LINE__);
+}
+
+TEST(a_file_cut_short_anywhere_is_refused)
+{
+    size_t size;
+    unsigned char *bytes = file_of("", good_tensors, "F32", -1, 0.0f, &size);
+    for (size_t n = 0; n < size; n += test_quick() ? 29 : 3) {
+        dist_context *ctx = test_context();
+        unsigned char *exact = (unsigned char *)malloc(n + 1);
+        REQUIRE(exact != NULL);
+        memcpy(exact, bytes, n);
+        CHECK(dist_net_load(ctx, exact, n) == NULL);
+        CHECK_STATUS(DIST_BAD_FILE, dist_context_status(ctx), ctx);
+        free(exact);
+        dist_context_destroy(ctx);
+    }
+    free(bytes);
+}
+
+TEST(null_handles_are_refused)
+{
+    dist_context *ctx = test_context();
+    dist_net_desc d = small_desc();
+    dist_net *net = dist_net_create(ctx, &d);
+    dist_shape *shape = dist_shape_create(ctx, net, NULL);
+    float x[5] = {0};
+    size_t size;
+    CHECK(dist_net_load(NULL, x, 4) == NULL);
+    CHECK(dist_net_load(ctx, NULL, 4) == NULL);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_context_status(ctx), ctx);
+    CHECK(dist_net_load_file(ctx, NULL) == NULL);
+    CHECK(dist_net_create(NULL, &d) == NULL);
+    CHECK_EQUAL(DIST_BAD_ARGUMENT, dist_net_save(NULL, net, NULL, 0, &size));
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_net_save(ctx, NULL, NULL, 0, &size), ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_net_save(ctx, net, NULL, 0, NULL), ctx);
+    CHECK(dist_net_save_file(ctx, NULL, "x") != DIST_OK);
+    CHECK(dist_net_save_file(ctx, net, NULL) != DIST_OK);
+    CHECK_EQUAL(0, dist_net_code_size(NULL) + dist_net_code_count(NULL) + dist_net_channels(NULL));
+    CHECK(dist_net_code(NULL, 0) == NULL && dist_net_weights(NULL) == NULL);
+    CHECK_EQUAL(0, dist_net_operations(NULL, 0) + dist_net_weight_count(NULL));
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_net_set_weights(ctx, NULL, x), ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_net_set_weights(ctx, net, NULL), ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_net_set_code(ctx, NULL, 0, x), ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_net_set_code(ctx, net, 0, NULL), ctx);
+    CHECK(dist_shape_create(NULL, net, NULL) == NULL);
+    CHECK(dist_shape_create(ctx, NULL, NULL) == NULL);
+    CHECK_EQUAL(DIST_BAD_ARGUMENT, dist_shape_set_code(NULL, x));
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_shape_eval(ctx, NULL, 1, x, x + 3), ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_shape_eval(ctx, shape, 1, NULL, x + 3), ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_shape_eval(ctx, shape, 1, x, NULL), ctx);
+    dist_field none = dist_shape_field(NULL);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_eval(ctx, &none, 1, x, x + 3, NULL), ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_eval(ctx, NULL, 1, x, x + 3, NULL), ctx);
+    dist_net_destroy(NULL);
+    dist_shape_destroy(NULL);
+    dist_shape_destroy(shape);
+    dist_net_destroy(net);
+    dist_context_destroy(ctx);
+}
+
+/* ---- BLAS -------------------------------------------------------------------------------------------------------- */
+
+typedef struct plain_blas {
+    int calls;
+    int wrong; /* 1: forgets beta; 2: does not transpose b; 3: takes lda for packed */
+} plain_blas;
+
+static void plain_sgemm(void *user, int transpose_a, int transpose_b, int m, int n, int k, float alpha, const float *a,
+                        int lda, const float *b, int ldb, float beta, float *c, int ldc)
+{
+    plain_blas *blas = (plain_blas *)user;
+    blas->calls++;
+    if (blas->wrong == 2) transpose_b = 0;
+    if (blas->wrong == 3) lda = transpose_a ? m : k;
+    for (int i = 0; i < m; i++)
+        for (int j = 0; j < n; j++) {
+            float sum = 0.0f;
+            for (int l = 0; l < k; l++)
+                sum +=
+                    (transpose_a ? a[l * lda + i] : a[i * lda + l]) * (transpose_b ? b[j * ldb + l] : b[l * ldb + j]);
+            float old = beta == 0.0f || blas->wrong == 1 ? 0.0f : beta * c[i * ldc + j];
+            c[i * ldc + j] = alpha * sum + old;
+        }
+}
+
+typedef struct blas_result {
+    float sdf[POINTS], gradient[3 * POINTS], code[5];
+    float *weights;
+    int calls;
+} blas_result;
+
+static void blas_run(int width, int use, int activation, blas_result *r)
+{
+    plain_blas blas = {0, 0};
+    dist_context_desc desc = test_context_desc();
+    dist_net_desc d = small_desc();
+    float points[3 * POINTS], d_sdf[POINTS], code[5] = {0.5f, -0.5f, 1, 0, 0.25f};
+    dist_gradients grads;
+    test_random random = test_random_seed(4);
+    memset(r, 0, sizeof *r);
+    desc.blas.user = &blas;
+    desc.blas.sgemm_fn = use ? plain_sgemm : NULL;
+    dist_context *ctx = dist_context_create(&desc);
+    CHECK_STATUS(DIST_OK, dist_context_status(ctx), ctx);
+    blas.calls = 0;
+    d.width = width;
+    d.activation = activation;
+    d.scale = activation == DIST_ACTIVATION_SOFTPLUS ? 10.0f : 0.0f;
+    dist_net *net = dist_net_create(ctx, &d);
+    dist_shape *shape = dist_shape_create(ctx, net, code);
+    dist_field field = dist_shape_field(shape);
+    test_random_fill(&random, 3 * POINTS, points, -1.0f, 1.0f);
+    test_random_fill(&random, POINTS, d_sdf, -1.0f, 1.0f);
+    r->weights = (float *)calloc(field.weight_count, sizeof(float));
+    memset(&grads, 0, sizeof grads);
+    grads.code = r->code;
+    grads.weights = r->weights;
+    CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &field, POINTS, points, r->sdf, r->gradient), ctx);
+    CHECK_STATUS(DIST_OK, dist_field_backward(ctx, &field, POINTS, points, d_sdf, NULL, NULL, NULL, &grads), ctx);
+    r->calls = blas.calls;
+    dist_shape_destroy(shape);
+    dist_net_destroy(net);
+    dist_context_destroy(ctx);
+}
+
+TEST(the_users_blas_gives_the_same_numbers_for_wide_layers_and_is_left_alone_for_narrow_ones)
+{
+    static const int activations[2] = {DIST_ACTIVATION_RELU, DIST_ACTIVATION_SOFTPLUS};
+    for (int k = 0; k < 4; k++) {
+        blas_result a, b;
+        int width = k % 2 ? 144 : 48;
+        blas_run(width, 0, activations[k / 2], &a);
+        blas_run(width, 1, activations[k / 2], &b);
+        CHECK((b.calls > 0) == (width >= 128));
+        CHECK_NEAR_ARRAY(POINTS, a.sdf, b.sdf, 1e-6);
+        CHECK_NEAR_ARRAY(3 * POINTS, a.gradient, b.gradient, 1e-6);
+        CHECK_NEAR_ARRAY(5, a.code, b.code, 1e-5);
+        CHECK_NEAR_ARRAY((size_t)width * 9, a.weights, b.weights, 1e-5);
+        free(a.weights);
+        free(b.weights);
+    }
+}
+
+TEST(a_wrong_blas_is_refused_when_the_context_is_made)
+{
+    for (int wrong = 0; wrong <= 3; wrong++) {
+        plain_blas blas = {0, 0};
+        blas.wrong = wrong;
+        dist_context_desc desc = test_context_desc();
+        desc.blas.user = &blas;
+        desc.blas.sgemm_fn = plain_sgemm;
+        dist_context *ctx = dist_context_create(&desc);
+        CHECK_STATUS(wrong ? DIST_BAD_ARGUMENT : DIST_OK, dist_context_status(ctx), ctx);
+        if (wrong) CHECK_TEXT("blas.sgemm_fn", dist_context_message(ctx));
+        if (wrong) CHECK(dist_net_create(ctx, NULL) == NULL);
+        dist_context_destroy(ctx);
+    }
+}
+
+/* ---- real decoders ----------------------------------------------------------------------------------------------- */
+
+/* "name" or "name.3" of the folder nets: the net and the number behind the dot, -1 without. */
+static dist_net *real_net(dist_context *ctx, const char *name, int *code)
+{
+    char file[128];
+    size_t n = strcspn(name, ".");
+    *code = name[n] ? (int)strtol(name + n + 1, NULL, 10) : -1;
+    snprintf(file, sizeof file, "nets/%.*s.safetensors", (int)n, name);
+    return dist_net_load_file(ctx, test_data_path(file));
+}
+
+/* Does the reference's gradient hold a rounding away from p, on the other side of a kink? */
+static int kink_beside(dist_context *ctx, const dist_field *field, const float p[3], const double expected[3])
+{
+    float points[18], sdf[6], gradient[18];
+    for (int i = 0; i < 18; i++) points[i] = p[i % 3] + (i / 3 / 2 == i % 3 ? (i / 3 % 2 ? -3e-6f : 3e-6f) : 0.0f);
+    CHECK_STATUS(DIST_OK, dist_field_eval(ctx, field, 6, points, sdf, gradient), ctx);
+    for (int i = 0; i < 6; i++) {
+        double error = 0.0, length = 0.0;
+        for (int k = 0; k < 3; k++) {
+            double difference = (double)gradient[3 * i + k] - expected[k];
+            error += difference * difference;
+            length += expected[k] * expected[k];
+        }
+        if (error <= 1e-8 * length) return 1;
+    }
+    return 0;
+}
+
+static void real_check(const char *name, int flat_allowed)
+{
+    char file[128];
+    size_t size;
+    int code, flat = 0, kinks = 0;
+    snprintf(file, sizeof file, "nets/%s.ref.f64", name);
+    double *reference = (double *)test_file_read(test_data_path(file), &size);
+    if (!reference) SKIP("the real decoders are not here");
+    dist_context *ctx = test_context();
+    dist_net *net = real_net(ctx, name, &code);
+    dist_shape *shape = dist_shape_create(ctx, net, code >= 0 ? dist_net_code(net, code) : NULL);
+    CHECK_STATUS(DIST_OK, dist_context_status(ctx), ctx);
+    if (!shape) {
+        free(reference);
+        return;
+    }
+    dist_field field = dist_shape_field(shape);
+    int n = dist_net_code_size(net), row = 7 + n, rows = (int)(size / sizeof(double)) / row;
+    int code_rows = test_quick()                            ? 4
+                    : dist_net_operations(net, 1) > 1000000 ? 24
+                                                            : 64,
+        sine = strstr(name, "sine") != NULL;
+    double largest = 1.0, steepest = 0.0, steepest_code = 0.0, f_error = 0.0, g_error = 0.0, c_error = 0.0;
+    float *points = (float *)calloc((size_t)rows * 7, sizeof(float)),
+          *d_code = (float *)calloc((size_t)n + 1, sizeof(float));
+    float *sdf = points + 3 * rows, *gradient = sdf + rows;
+    for (int i = 0; i < rows; i++) {
+        const double *r = reference + i * row;
+        double length = 0.0;
+        for (int k = 0; k < 3; k++) points[3 * i + k] = (float)r[k];
+        largest = fmax(largest, fabs(r[3]));
+        steepest = fmax(steepest, sqrt(r[4] * r[4] + r[5] * r[5] + r[6] * r[6]));
+        for (int j = 0; j < n; j++) length += r[7 + j] * r[7 + j];
+        steepest_code = fmax(steepest_code, sqrt(length));
+    }
+    CHECK_EQUAL(256, rows);
+    CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &field, (size_t)rows, points, sdf, gradient), ctx);
+    for (int i = 0; i < rows; i++) {
+        const double *r = reference + i * row;
+        double error = 0.0, length = 0.0;
+        float one = 1.0f;
+        dist_gradients grads;
+        f_error = fmax(f_error, fabs((double)sdf[i] - r[3]));
+        for (int k = 0; k < 3; k++) {
+            error += ((double)gradient[3 * i + k] - r[4 + k]) * ((double)gradient[3 * i + k] - r[4 + k]);
+            length += r[4 + k] * r[4 + k];
+        }
+        /* On a plateau the gradient is what is left when terms of the usual size cancel: float's rounding of those. */
+        if (sqrt(length) <= 1e-5 * steepest) {
+            flat++;
+            CHECK(sqrt(error) <= 1e-7 * steepest);
+            continue;
+        }
+        if (sqrt(error / length) > 1e-4 && kink_beside(ctx, &field, points + 3 * i, r + 4)) {
+            kinks++;
+            continue;
+        }
+        g_error = fmax(g_error, sqrt(error / length));
+        if (n == 0 || i >= code_rows) continue;
+        memset(&grads, 0, sizeof grads);
+        memset(d_code, 0, (size_t)n * sizeof(float));
+        grads.code = d_code;
+        CHECK_STATUS(DIST_OK, dist_field_backward(ctx, &field, 1, points + 3 * i, &one, NULL, NULL, NULL, &grads), ctx);
+        error = length = 0.0;
+        for (int j = 0; j < n; j++) {
+            error += ((double)d_code[j] - r[7 + j]) * ((double)d_code[j] - r[7 + j]);
+            length += r[7 + j] * r[7 + j];
+        }
+        if (sqrt(length) > 1e-5 * steepest_code) c_error = fmax(c_error, sqrt(error / length));
+    }
+    CHECK_NEAR(0.0, f_error, (sine ? 2e-5 : 2e-6) * largest);
+    CHECK_NEAR(0.0, g_error, 1e-4);
+    CHECK_NEAR(0.0, c_error, 1e-4);
+    CHECK(flat <= flat_allowed);
+    CHECK(kinks <= 2);
+    if (test_state.verbose)
+        printf("    %s: f %.1e of %.2f, point gradient %.1e, code gradient %.1e, %d flat\n", name, f_error, largest,
+               g_error, c_error, flat);
+    free(points);
+    free(d_code);
+    free(reference);
+    dist_shape_destroy(shape);
+    dist_net_destroy(net);
+    dist_context_destroy(ctx);
+}
+
+TEST(bob_spot_0_matches_its_reference) { real_check("bob_spot.0", 0); }
+TEST(bob_spot_1_matches_its_reference) { real_check("bob_spot.1", 0); }
+TEST(bunny_relu_matches_its_reference) { real_check("bunny_relu", 0); }
+TEST(chairs_1_matches_its_reference) { real_check("chairs.1", 0); }
+TEST(chairs_3_matches_its_reference) { real_check("chairs.3", 0); }
+TEST(deepsdf_512_0_matches_its_reference) { real_check("deepsdf_512.0", 0); }
+TEST(deepsdf_512_2_matches_its_reference) { real_check("deepsdf_512.2", 0); }
+TEST(deepsdf_512_4_matches_its_reference) { real_check("deepsdf_512.4", 0); }
+TEST(deepsdf_512_8_matches_its_reference) { real_check("deepsdf_512.8", 0); }
+TEST(deepsdf_512_he_0_matches_its_reference) { real_check("deepsdf_512_he.0", 0); }
+TEST(fox_matches_its_reference) { real_check("fox", 0); }
+TEST(mug_camera_bottle_0_matches_its_reference) { real_check("mug_camera_bottle.0", 0); }
+TEST(mug_camera_bottle_1_matches_its_reference) { real_check("mug_camera_bottle.1", 0); }
+TEST(mug_camera_bottle_2_matches_its_reference) { real_check("mug_camera_bottle.2", 0); }
+/* These learned a distance clamped at 0.5: almost half of the points lie where f is flat, at tanh(0.5). */
+TEST(primitives_7_matches_its_reference) { real_check("primitives.7", 128); }
+TEST(primitives_13_matches_its_reference) { real_check("primitives.13", 128); }
+TEST(primitives_15_matches_its_reference) { real_check("primitives.15", 128); }
+TEST(primitives_29_matches_its_reference) { real_check("primitives.29", 128); }
+TEST(rings_matches_its_reference) { real_check("rings", 0); }
+TEST(round_cross_0_matches_its_reference) { real_check("round_cross.0", 0); }
+TEST(round_cross_10_matches_its_reference) { real_check("round_cross.10", 0); }
+TEST(spot_geometry_0_matches_its_reference) { real_check("spot_geometry.0", 0); }
+TEST(two_spheres_sine_matches_its_reference) { real_check("two_spheres_sine", 0); }
+
+TEST(colors_of_spot_texture_match_its_reference)
+{
+    size_t size;
+    int code;
+    double worst = 0.0;
+    double *reference = (double *)test_file_read(test_data_path("nets/spot_texture.ref.f64"), &size);
+    if (!reference) SKIP("the real decoders are not here");
+    dist_context *ctx = test_context();
+    dist_net *net = real_net(ctx, "spot_texture", &code);
+    dist_shape *shape = dist_shape_create(ctx, net, dist_net_code(net, 0));
+    CHECK_STATUS(DIST_OK, dist_context_status(ctx), ctx);
+    REQUIRE(shape != NULL && dist_net_channels(net) == 3);
+    int rows = (int)(size / sizeof(double)) / 7;
+    CHECK_EQUAL(1000, rows);
+    float *points = (float *)calloc((size_t)rows * 6, sizeof(float)), *color = points + 3 * rows;
+    for (int i = 0; i < 3 * rows; i++) points[i] = (float)reference[i / 3 * 7 + i % 3];
+    CHECK_STATUS(DIST_OK, dist_shape_eval(ctx, shape, (size_t)rows, points, color), ctx);
+    for (int i = 0; i < 3 * rows; i++) worst = fmax(worst, fabs((double)color[i] - reference[i / 3 * 7 + 4 + i % 3]));
+    CHECK_NEAR(0.0, worst, 1e-5);
+    if (test_state.verbose) printf("    spot_texture: colors %.1e\n", worst);
+    free(points);
+    free(reference);
+    dist_shape_destroy(shape);
+    dist_net_destroy(net);
+    dist_context_destroy(ctx);
+}
+
+int main(int argc, char **argv)
+{
+    test_begin(argc, argv);
+    RUN(every_form_of_file_gives_the_values_that_the_format_says);
+    RUN(every_form_of_file_gives_point_gradients_that_match_differences);
+    RUN(every_form_of_file_gives_code_gradients_that_match_differences);
+    RUN(what_the_file_says_of_code_channels_bound_and_clamp_is_what_the_net_tells);
+    RUN(color_is_the_three_channels_behind_one_another);
+    RUN(a_code_folded_by_hand_gives_the_same_values);
+    RUN(setting_a_code_equals_making_the_shape_with_it);
+    RUN(operations_of_a_net_are_its_multiply_adds);
+    RUN(a_point_has_the_same_bits_in_every_batch);
+    RUN(a_dead_unit_that_is_left_out_changes_no_bit);
+    RUN(a_saved_net_loads_and_saves_to_the_same_bytes_and_values);
+    RUN(saving_into_too_small_a_buffer_is_refused);
+    RUN(a_net_saved_to_a_file_is_loaded_from_it);
+    RUN(a_geometric_start_is_near_the_distance_to_a_sphere_of_half_the_bound);
+    RUN(a_seed_gives_the_same_net_and_another_seed_another);
+    RUN(a_net_made_has_the_form_asked_for);
+    RUN(a_net_that_cannot_be_made_is_refused);
+    RUN(set_weights_makes_one_net_the_other);
+    RUN(numbers_that_are_not_finite_are_refused_and_change_nothing);
+    RUN(the_file_that_the_wrong_ones_are_made_of_is_right);
+    RUN(tensors_that_do_not_fit_are_refused_with_a_sentence);
+    RUN(a_layer_missing_in_the_middle_is_refused);
+    RUN(metadata_that_means_nothing_is_refused_with_a_sentence);
+    RUN(weights_that_are_not_finite_and_unknown_types_are_refused);
+    RUN(a_file_cut_short_anywhere_is_refused);
+    RUN(null_handles_are_refused);
+    RUN(the_users_blas_gives_the_same_numbers_for_wide_layers_and_is_left_alone_for_narrow_ones);
+    RUN(a_wrong_blas_is_refused_when_the_context_is_made);
+    RUN(bob_spot_0_matches_its_reference);
+    RUN(bob_spot_1_matches_its_reference);
+    RUN(bunny_relu_matches_its_reference);
+    RUN(chairs_1_matches_its_reference);
+    RUN(chairs_3_matches_its_reference);
+    RUN(deepsdf_512_0_matches_its_reference);
+    RUN(deepsdf_512_2_matches_its_reference);
+    RUN(deepsdf_512_4_matches_its_reference);
+    RUN(deepsdf_512_8_matches_its_reference);
+    RUN(deepsdf_512_he_0_matches_its_reference);
+    RUN(fox_matches_its_reference);
+    RUN(mug_camera_bottle_0_matches_its_reference);
+    RUN(mug_camera_bottle_1_matches_its_reference);
+    RUN(mug_camera_bottle_2_matches_its_reference);
+    RUN(primitives_7_matches_its_reference);
+    RUN(primitives_13_matches_its_reference);
+    RUN(primitives_15_matches_its_reference);
+    RUN(primitives_29_matches_its_reference);
+    RUN(rings_matches_its_reference);
+    RUN(round_cross_0_matches_its_reference);
+    RUN(round_cross_10_matches_its_reference);
+    RUN(spot_geometry_0_matches_its_reference);
+    RUN(two_spheres_sine_matches_its_reference);
+    RUN(colors_of_spot_texture_match_its_reference);
+    return test_report();
+}

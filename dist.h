@@ -361,7 +361,7 @@ typedef struct dist_render_desc {
     int samples;         /* K of the paper's gradient, 1 to 8; 0: 1 */
     int trace;           /* DIST_TRACE_* */
     int paper_row;       /* DIST_PAPER_* */
-    int gradient;        /* DIST_GRADIENT_*; AUTO: NORMAL with the guarded tracer, PAPER with the paper's */
+    int gradient;        /* DIST_GRADIENT_*; AUTO: PAPER, which fitted best where measured (README) */
     float gradient_cap;  /* tau: |grad f . v| counts as at least tau |grad f|; 0: 0.1 */
     int normal_mode;     /* DIST_NORMAL_* */
     float normal_delta;  /* half step of differences, shape units; 0: 1e-3 of the bounding radius */
@@ -4357,11 +4357,18 @@ static dist_status disti_loader_shapes(disti_loader *loader)
             loader->ctx, DIST_BAD_FILE,
             "dist_net_load: no tensor is called lin0.weight, lin0.weight_v or the like (also with module. before it)",
             NULL, 0, 0);
+    for (int k = net->layers + 1; k <= DISTI_MAX_LAYERS; k++)
+        if (disti_loader_weight(loader, k, &gain))
+            return disti_fail(loader->ctx, DIST_BAD_FILE, "dist_net_load: layer %d is there, but layer %d is missing",
+                              NULL, k, net->layers);
     if (net->layers == DISTI_MAX_LAYERS && disti_loader_weight(loader, DISTI_MAX_LAYERS, &gain))
         return disti_fail(loader->ctx, DIST_UNSUPPORTED, "dist_net_load: more than %d layers", NULL, DISTI_MAX_LAYERS,
                           0);
     size = net->layer[0].in - net->point_size;
     if (disti_loader_number(loader, "dist.code_size", 0, DISTI_MAX_WIDTH, &size) != DIST_OK) return DIST_BAD_FILE;
+    if (size < 0)
+        return disti_fail(loader->ctx, DIST_BAD_FILE, "dist_net_load: lin0 takes %d numbers, fewer than the point's %d",
+                          NULL, net->layer[0].in, net->point_size);
     if (size != (int)size || size + net->point_size != net->layer[0].in)
         return disti_fail(loader->ctx, DIST_BAD_FILE,
                           "dist_net_load: layer 0 takes %d numbers, but code and point have %d", NULL, net->layer[0].in,
@@ -4958,6 +4965,8 @@ DIST_API dist_camera dist_camera_look_at(int width, int height, float fov_y, con
     camera.fx = camera.fy = (float)(height / 2.0 / tan((double)fov_y / 2.0));
     camera.cx = (float)((width - 1) / 2.0);
     camera.cy = (float)((height - 1) / 2.0);
+    if ((eye && !disti_finite_all(3, eye)) || (at && !disti_finite_all(3, at)) || (up && !disti_finite_all(3, up)))
+        camera.fx = 0.0f; /* refused by whoever takes the camera */
     for (int i = 0; i < 3; i++) {
         center[i] = eye ? (double)eye[i] : 0.0;
         m[6 + i] = (at ? (double)at[i] : 0.0) - center[i];
@@ -5096,15 +5105,15 @@ typedef struct disti_ray {
     float s, f;         /* front: nothing lies before it */
     float slope;        /* df/ds of the last two samples */
     float a, fa, b, fb; /* bracket: fa > 0 >= fb, a < b; while marching b, fb: a sample beyond a gap, fb = 0: none */
-    float width;        /* bracket's width two queries ago */
+    float width;        /* bracket's width at first */
     float best, fbest;  /* sample of smallest |f| */
     float error;
     float sign;         /* -1: looking for the way out of the solid */
     unsigned short steps;
     unsigned char mode, status;
-    unsigned char side; /* bracket: queries since its width was noted; band: queries in it */
-    unsigned char
-        moved; /* bracket: its end that moved last, 1 b, 2 a, 3 b twice; band: 1 if the ray came into it from outside */
+    unsigned char known; /* marching: the slope is measured */
+    unsigned char side;  /* bracket, band: queries in it so far; marching: steps since a sample beyond was negative */
+    unsigned char moved; /* band: 1 if the ray came into it from outside */
 } disti_ray;
 
 enum {
@@ -5137,8 +5146,7 @@ DIST_API dist_render_desc dist_render_desc_resolve(const dist_render_desc *desc)
     if (how.step_scale == 0.0f) how.step_scale = 1.5f;
     if (how.epsilon == 0.0f && how.trace == DIST_TRACE_PAPER) how.epsilon = 5e-5f;
     if (how.samples == 0) how.samples = 1;
-    if (how.gradient == DIST_GRADIENT_AUTO)
-        how.gradient = how.trace == DIST_TRACE_PAPER ? DIST_GRADIENT_PAPER : DIST_GRADIENT_NORMAL;
+    if (how.gradient == DIST_GRADIENT_AUTO) how.gradient = DIST_GRADIENT_PAPER;
     if (how.gradient_cap == 0.0f) how.gradient_cap = 0.1f;
     if (how.normal_delta == 0.0f) how.normal_delta = 1e-3f;
     return how;
@@ -5286,34 +5294,33 @@ static int disti_ray_ask(disti_ray *ray, int mode, float q)
     return 1;
 }
 
-/* Bracket [a, b], fa > 0 >= fb: regula falsi with Illinois' halving of the end that stays; a bisection whenever
-   three queries did not halve it. So slope, clamp and kinks cannot make it oscillate, and equal ends cannot divide
-      by 0. */
+/* Bracket [a, b], fa > 0 >= fb, finished by ITP (Oliveira and Takahashi 2020): regula falsi, pushed a little toward the
+   middle and kept so near it that no more queries are needed than a bisection's plus one. So slope, clamp and kinks cannot
+   make it oscillate or crawl, and equal ends cannot divide by 0. */
 static int disti_ray_bracket(const disti_tracer *tracer, disti_ray *ray)
 {
-    float width = ray->b - ray->a;
-    float tolerance = 0.25f * disti_ray_epsilon(tracer, ray, ray->a);
-    float spacing = 2.4e-7f * tracer->field->radius; /* s has no finer steps */
+    float width = ray->b - ray->a, middle = 0.5f * (ray->a + ray->b);
+    float epsilon = DISTI_MAX(disti_ray_epsilon(tracer, ray, ray->a), 2.4e-7f * tracer->field->radius);
     float q = ray->a + width * (ray->fa / (ray->fa - ray->fb));
-    if (width <= DISTI_MAX(tolerance, spacing)) {
-        ray->slope = (ray->fb - ray->fa) / DISTI_MAX(width, spacing);
+    if (width <= epsilon) {
+        ray->slope = (ray->fb - ray->fa) / width;
         return disti_ray_end(ray, DIST_RAY_HIT, q, 0.0f, width);
     }
-    int lopsided = ray->moved == 3 && -ray->fb < 0.01f * ray->fa &&
-                   width > 64.0f * tolerance; /* f is flat beyond: regula falsi would crawl */
-    if (lopsided || (ray->side >= 3 && width > 0.5f * ray->width)) {
-        q = 0.5f * (ray->a + ray->b);
-        ray->side = 0;
-    }
-    if (ray->side == 0) ray->width = width;
+    float room = epsilon; /* how far from the middle q may lie: what bisection would have left by now, less half the width */
+    while (room < ray->width) room *= 2.0f;
+    for (int i = 0; i < ray->side; i++) room *= 0.5f;
+    room = DISTI_MAX(room - 0.5f * width, 0.0f);
+    float toward = middle > q ? 1.0f : -1.0f;
+    float push = ray->side == 0 ? 0.0f : DISTI_MAX(0.1f * width * (width / ray->width), 0.1f * epsilon);
+    q = (middle - q) * toward > push ? q + toward * push : middle;
+    if ((middle - q) * toward > room) q = middle - toward * room;
+    float least = DISTI_MIN(0.125f * epsilon, 0.25f * width); /* never at an end */
+    q = DISTI_MIN(DISTI_MAX(q, ray->a + least), ray->b - least);
     ray->side++;
-    float least = DISTI_MIN(0.5f * tolerance, 0.25f * width);
-    q = DISTI_MAX(q, ray->a + least);
-    q = DISTI_MIN(q, ray->b - least);
     return disti_ray_ask(ray, DISTI_BRACKET, q);
 }
 
-/* A sample inside the bracket. The error is judged in s: |f| over the slope across the bracket. */
+/* A sample inside the bracket. The error is judged in s: |f| over the slopes to the bracket's ends. */
 static int disti_ray_bracketed(const disti_tracer *tracer, disti_ray *ray, float f)
 {
     float tolerance = 0.25f * disti_ray_epsilon(tracer, ray, ray->q);
@@ -5322,22 +5329,17 @@ static int disti_ray_bracketed(const disti_tracer *tracer, disti_ray *ray, float
     float slope = inside ? slope_a : slope_b;
     float other = inside ? slope_b : slope_a;
     float magnitude = f < 0.0f ? -f : f;
-    if (magnitude <= tolerance * slope * 0.5f && magnitude <= tolerance * (other > 0.0f ? other : -other)) {
-        float s = ray->q + f / slope; /* one secant correction without a query */
-        float error = magnitude / DISTI_MIN(slope, other > 0.0f ? other : -other);
+    float flatter = DISTI_MIN(slope, other > 0.0f ? other : -other);
+    if (slope > 1e-3f && magnitude <= tolerance * DISTI_MIN(0.5f * slope, flatter)) {
         ray->slope = -slope;
-        return disti_ray_end(ray, DIST_RAY_HIT, s, 0.0f, error);
+        return disti_ray_end(ray, DIST_RAY_HIT, ray->q + f / slope, 0.0f, magnitude / flatter); /* one secant more */
     }
     if (inside) {
         ray->b = ray->q;
         ray->fb = f;
-        if (ray->moved & 1) ray->fa *= 0.5f;
-        ray->moved = ray->moved & 1 ? 3 : 1;
     } else {
         ray->a = ray->q;
         ray->fa = f;
-        if (ray->moved == 2) ray->fb *= 0.5f;
-        ray->moved = 2;
     }
     return disti_ray_bracket(tracer, ray);
 }
@@ -5348,7 +5350,8 @@ static int disti_ray_open_bracket(const disti_tracer *tracer, disti_ray *ray, fl
     ray->fa = fa;
     ray->b = b;
     ray->fb = fb;
-    ray->side = ray->moved = 0;
+    ray->width = b - a;
+    ray->side = 0;
     return disti_ray_bracket(tracer, ray);
 }
 
@@ -5368,17 +5371,23 @@ static int disti_ray_step(const disti_tracer *tracer, disti_ray *ray)
     float radius = ray->f / tracer->lipschitz;
     float epsilon = disti_ray_epsilon(tracer, ray, ray->s);
     float slope = ray->slope / tracer->lipschitz;
+    if (ray->fb < 0.0f && ray->s + radius >= ray->b) /* not Lipschitz after all */
+        return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->b, ray->fb);
     if (ray->s + radius >= ray->leave)
         return disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest * ray->sign, 0.0f);
-    float stretch = ray->steps < 2 ? tracer->how.step_scale : DISTI_MAX(1.0f, 1.8f / (1.0f - DISTI_MIN(slope, 0.75f)));
+    float stretch = !ray->known ? tracer->how.step_scale : DISTI_MAX(1.0f, 1.8f / (1.0f - DISTI_MIN(slope, 0.75f)));
     float step = radius * DISTI_MIN(stretch, 8.0f);
     int mode = DISTI_MARCH;
-    if (ray->steps >= 2 && slope < -0.05f && ray->f < 0.05f * tracer->field->radius) {
-        float jump = 1.1f * ray->f / -ray->slope + 0.5f * epsilon;
+    if (ray->known && slope < -0.05f && ray->f < 0.05f * tracer->field->radius) {
+        float jump = 1.03f * ray->f / -ray->slope + 0.5f * epsilon;
         step = DISTI_MIN(jump, 3.0f * radius + epsilon);
         mode = DISTI_JUMP;
     }
-    if (ray->steps >= 2 && slope > -0.3f) step = DISTI_MAX(step, disti_ray_floor(tracer, ray));
+    if (ray->known && slope > -0.3f) { /* but not through a surface that the slope foretells */
+        float floor = disti_ray_floor(tracer, ray);
+        if (slope < 0.0f) floor = DISTI_MIN(floor, 0.9f * ray->f / -ray->slope);
+        step = DISTI_MAX(step, floor);
+    }
     float q = ray->s + step;
     float spacing = ray->s + 2.4e-7f * tracer->field->radius;
     q = DISTI_MAX(q, spacing);
@@ -5389,8 +5398,10 @@ static int disti_ray_step(const disti_tracer *tracer, disti_ray *ray)
    matter or it followed a surface at a low angle and found f about where the slope said. */
 static int disti_ray_trusts(const disti_tracer *tracer, const disti_ray *ray, float f, float step)
 {
-    if (ray->slope > -0.3f * tracer->lipschitz && step <= 1.001f * disti_ray_floor(tracer, ray)) return 1;
     float expected = ray->f + ray->slope * step;
+    if (!ray->known) return 0;
+    int creeps = ray->slope > -0.3f * tracer->lipschitz && step <= 1.001f * disti_ray_floor(tracer, ray);
+    if (creeps && expected > 0.0f) return 1;
     float off = f - expected;
     return ray->mode == DISTI_JUMP && expected > 0.0f && (off < 0.0f ? -off : off) < 0.3f * ray->f;
 }
@@ -5428,6 +5439,8 @@ static int disti_ray_band(const disti_tracer *tracer, disti_ray *ray, float f)
         ray->s = ray->q;
         ray->f = f;
         ray->slope = slope;
+        ray->known = 1;
+        ray->fb = 0.0f; /* the band is over */
         return ray->q >= ray->leave ? disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest * ray->sign, 0.0f)
                                     : disti_ray_step(tracer, ray);
     }
@@ -5495,6 +5508,8 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
         if (ray->steps < tracer->how.max_steps + 40) return disti_ray_bracketed(tracer, ray, f);
         return disti_ray_end(ray, DIST_RAY_HIT, 0.5f * (ray->a + ray->b), 0.0f, ray->b - ray->a);
     }
+    if (ray->steps >= tracer->how.max_steps && f > 0.0f && ray->mode != DISTI_BAND && ray->fb < 0.0f && ray->b > ray->s)
+        return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->b, ray->fb);
     if (ray->steps >= tracer->how.max_steps && f > 0.0f)
         return disti_ray_end(ray, DIST_RAY_UNRESOLVED, ray->best, ray->fbest * ray->sign, 0.0f);
     switch (ray->mode) {
@@ -5508,6 +5523,8 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
         }
         ray->s = q;
         ray->f = f;
+        ray->slope = 0.0f;
+        ray->known = 0;
         break;
     case DISTI_BACK:
         if (f >= 0.0f) return disti_ray_open_bracket(tracer, ray, q, f, ray->b, ray->fb);
@@ -5521,20 +5538,35 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
     case DISTI_SKIP:
     case DISTI_MARCH:
     case DISTI_JUMP: {
-        if (f <= 0.0f) return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, q, f);
         float radius = ray->f / tracer->lipschitz, step = q - ray->s;
         float spacing = 4.8e-7f * tracer->field->radius;
-        if (ray->mode != DISTI_SKIP && step > radius + f / tracer->lipschitz && step > 1.0001f * radius + spacing &&
-            !disti_ray_trusts(tracer, ray, f, step)) { /* a gap between the two spheres: back, and keep the far one */
-            float slope = (f - ray->f) / step;
+        if (ray->fb < 0.0f && f > 0.0f && q < ray->b && ++ray->side >= 3)
+            return disti_ray_open_bracket(tracer, ray, q, f, ray->b, ray->fb);
+        float gap = step - radius - (f < 0.0f ? -f : f) / tracer->lipschitz; /* what neither sphere covers */
+        int back = ray->mode != DISTI_SKIP && step > 1.0001f * radius + spacing;
+        if (f <= 0.0f && !(back && gap > 1e-3f * tracer->field->radius))
+            return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, q, f);
+        if (back && (f <= 0.0f || (gap > 0.0f && !disti_ray_trusts(tracer, ray, f, step)))) {
+            float slope = (f - ray->f) / step; /* something may hide in the gap: back, and keep the far sample */
             ray->slope = DISTI_MAX(slope, -tracer->lipschitz);
-            ray->b = q;
-            ray->fb = f;
+            ray->known = 1;
+            if (f <= 0.0f || !(ray->fb < 0.0f)) {
+                ray->side = 0;
+                ray->b = q;
+                ray->fb = f;
+            }
             return disti_ray_ask(ray, DISTI_MARCH, DISTI_MIN(ray->s + DISTI_MAX(radius, spacing), ray->leave));
+        }
+        if (ray->fb < 0.0f) { /* a crossing lies before b: is there room for another before it? */
+            float left = ray->b - q - (f - ray->fb) / tracer->lipschitz;
+            if (ray->b <= q) return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->b, ray->fb);
+            if (left <= 1e-3f * tracer->field->radius)
+                return disti_ray_open_bracket(tracer, ray, q, f, ray->b, ray->fb);
         }
         ray->slope = (f - ray->f) / step;
         ray->s = q;
         ray->f = f;
+        ray->known = 1;
         if (ray->fb > 0.0f && ray->b > q && ray->b - q <= (f + ray->fb) / tracer->lipschitz) { /* the gap is closed */
             ray->slope = (ray->fb - f) / (ray->b - q);
             ray->s = ray->b;
@@ -5545,6 +5577,8 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
     }
     }
     if (ray->f < disti_ray_epsilon(tracer, ray, ray->s)) {
+        if (ray->fb < 0.0f && ray->b > ray->s)
+            return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->b, ray->fb);
         ray->a = ray->b = ray->s;
         ray->fa = ray->fb = ray->f;
         ray->side = 0;
@@ -6168,7 +6202,8 @@ static void disti_silhouette(const disti_tracer *tracer, int worker, const disti
 {
     double *t = (double *)(void *)bench->rest;
     int n = tile->width * tile->height, across = (tile->width + 3) / 4;
-    float far = tracer->field->clamp > 0.0f ? 0.98f * tracer->field->clamp : 0.2f * tracer->field->radius;
+    float far = tracer->field->clamp > 0.0f ? 0.98f * tracer->field->clamp : 1e30f;
+    float near = tracer->field->clamp > 0.0f ? 0.2f * tracer->field->clamp : 1e30f; /* the outline's neighborhood */
     size_t count = 0;
     disti_silhouette_probe(tracer, worker, tile, bench, t);
     for (int i = 0; i < n; i++) {
@@ -6183,20 +6218,23 @@ static void disti_silhouette(const disti_tracer *tracer, int worker, const disti
     disti_silhouette_eval(tracer, worker, bench, count);
     for (size_t k = 0; k < count; k++)
         disti_keep_least(&bench->rays[bench->index[k]], bench->rays[bench->index[k]].q, bench->sdf[k]);
-    for (int round = 0; round < 3; round++) { /* left, right, and where the parabola is least */
+    for (int round = 0; round < 6; round++) { /* left, right, where the parabola is least; again, four times finer */
+        int phase = round % 3;
         count = 0;
         for (int i = 0; i < n; i++) {
             disti_ray *ray = &bench->rays[i];
-            if (!disti_wants_minimum(ray) || !(ray->width > 0.0f || round == 0)) continue;
-            if (round == 0) { /* a: the best sample as it stood; width: the parabola's half width, 0 for far rays */
+            if (!disti_wants_minimum(ray)) continue;
+            if (phase == 0) { /* a: the best sample as it stood; width: the parabola's half width, 0: done */
                 float magnitude = ray->fbest < 0.0f ? -ray->fbest : ray->fbest;
-                ray->width = magnitude < far ? DISTI_MAX(0.5f * magnitude, 2e-3f * tracer->field->radius) : 0.0f;
+                float limit = round == 0 ? far : DISTI_MIN(far, near);
+                float width = DISTI_MAX(0.5f * magnitude, 2e-3f * tracer->field->radius);
+                ray->width = magnitude < limit ? (round == 0 ? width : 0.25f * width) : 0.0f;
                 ray->a = ray->best;
                 ray->fa = ray->fbest;
-                if (!(ray->width > 0.0f)) continue;
             }
-            float ds = round == 0   ? -ray->width
-                       : round == 1 ? ray->width
+            if (!(ray->width > 0.0f)) continue;
+            float ds = phase == 0   ? -ray->width
+                       : phase == 1 ? ray->width
                                     : disti_parabola(ray->width, ray->b, ray->fa, ray->fb);
             ray->q = DISTI_MIN(DISTI_MAX(ray->a + ds, ray->enter), ray->leave);
             disti_ray_point(ray, ray->q, bench->points + 3 * count);
@@ -6205,8 +6243,8 @@ static void disti_silhouette(const disti_tracer *tracer, int worker, const disti
         disti_silhouette_eval(tracer, worker, bench, count);
         for (size_t k = 0; k < count; k++) {
             disti_ray *ray = &bench->rays[bench->index[k]];
-            if (round == 0) ray->b = bench->sdf[k];
-            if (round == 1) ray->fb = bench->sdf[k];
+            if (phase == 0) ray->b = bench->sdf[k];
+            if (phase == 1) ray->fb = bench->sdf[k];
             disti_keep_least(ray, ray->q, bench->sdf[k]);
         }
     }
@@ -6400,7 +6438,7 @@ typedef struct disti_entry {
     float d_distance;   /* dL/d(distance along the ray), field units */
     float d_sdf;        /* dL/df at this point from elsewhere: silhouette, normal's differences, the paper's samples */
     float direction[3]; /* of the ray, field space */
-    unsigned pixel;
+    float pivot[3];     /* the point that turns with the camera: the hit, also for a normal's differences around it */
     unsigned char capped;
 } disti_entry;
 
@@ -6844,7 +6882,7 @@ static void disti_backward_flush(disti_render_backward_job *job)
         if (!job->pose) continue;
         double p[3], y[3];
         for (size_t k = 0; k < 3; k++) {
-            p[k] = (double)tape->points[3 * i + k];
+            p[k] = (double)tape->entry[i].pivot[k];
             y[k] = (double)tape->d_points[3 * i + k];
         }
         disti_add_pull(job, p, y);
@@ -6854,13 +6892,14 @@ static void disti_backward_flush(disti_render_backward_job *job)
 }
 
 static void disti_backward_add(disti_render_backward_job *job, const disti_ray *ray, const float *point,
-                               float d_distance, float d_sdf)
+                               const float *pivot, float d_distance, float d_sdf)
 {
     const dist_tape *tape = job->tape;
     disti_entry *entry = &tape->entry[job->count];
     entry->d_distance = d_distance;
     entry->d_sdf = d_sdf;
     memcpy(entry->direction, ray->direction, sizeof entry->direction);
+    memcpy(entry->pivot, pivot, sizeof entry->pivot);
     memcpy(tape->points + 3 * job->count, point, 3 * sizeof(float));
     if (++job->count == DISTI_CHUNK) disti_backward_flush(job);
 }
@@ -6909,7 +6948,7 @@ static float disti_backward_normal(disti_render_backward_job *job, const disti_r
         for (size_t k = 0; k < count; k++)
             for (size_t i = 0; i < 3; i++) motion += seeds[k] * slopes[3 * k + i] * ray->direction[i];
     }
-    for (size_t k = 0; k < count; k++) disti_backward_add(job, ray, points + 3 * k, 0.0f, seeds[k]);
+    for (size_t k = 0; k < count; k++) disti_backward_add(job, ray, points + 3 * k, p, 0.0f, seeds[k]);
     return disti_finite(motion) ? motion : 0.0f;
 }
 
@@ -6948,16 +6987,16 @@ static void disti_backward_pixel(disti_render_backward_job *job, size_t pixel, f
             float f = samples[4 * k], seed = k == 0 ? d_silhouette : 0.0f;
             int inside_clamp = (f < 0.0f ? -f : f) <= 0.1f * field->radius;
             if (paper && inside_clamp) seed += disti_paper_alpha(&tracer->how) * d_distance;
-            if (seed != 0.0f) disti_backward_add(job, &ray, samples + 4 * k + 1, 0.0f, seed);
+            if (seed != 0.0f) disti_backward_add(job, &ray, samples + 4 * k + 1, samples + 4 * k + 1, 0.0f, seed);
         }
-        if (!paper && d_distance != 0.0f) disti_backward_add(job, &ray, p, d_distance, 0.0f);
+        if (!paper && d_distance != 0.0f) disti_backward_add(job, &ray, p, p, d_distance, 0.0f);
         return;
     }
     if (tracer->how.gradient == DIST_GRADIENT_PAPER) { /* all K samples are the hit */
         d_silhouette += tracer->how.step_scale * (float)tracer->how.samples * d_distance;
         d_distance = 0.0f;
     }
-    if (d_distance != 0.0f || d_silhouette != 0.0f) disti_backward_add(job, &ray, p, d_distance, d_silhouette);
+    if (d_distance != 0.0f || d_silhouette != 0.0f) disti_backward_add(job, &ray, p, p, d_distance, d_silhouette);
 }
 
 /* Upstream gradients that are not finite count as 0. */
@@ -7004,7 +7043,8 @@ DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *ta
     dist_status status = disti_enter(ctx, name);
     if (status != DIST_OK) return status;
     if (!tape || !tape->rendered)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: tape is %s; it must have been filled by dist_render",
+        return disti_fail(ctx, DIST_BAD_ARGUMENT,
+                          "dist_render_backward: tape is %s; it must have been filled by dist_render",
                           tape ? "empty" : "NULL", 0, 0);
     if (tape->ctx != ctx) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: tape belongs to another context", name, 0, 0);
     if (!d_out) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: d_out is NULL", name, 0, 0);
@@ -7692,7 +7732,7 @@ static int disti_extract_begin(disti_extract *x)
 /* Blocks of 8 cells, smaller where a clamped field could never rule one out; if 2 are still too many, all cells. */
 static void disti_extract_blocks(disti_extract *x)
 {
-    double slope = 1.1 * (x->field->lipschitz > 0.0f ? (double)x->field->lipschitz : 1.0);
+    double slope = 2.0 * (x->field->lipschitz > 0.0f ? (double)x->field->lipschitz : 1.0);
     double diagonal = slope * 1.7320508075688772 * (double)x->field->radius / (double)x->cells; /* half of one cell's */
     double visible = (double)x->field->clamp - fabs((double)x->level);
     x->block = 8;

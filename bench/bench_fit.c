@@ -10,7 +10,7 @@
 static const char usage[] =
     "bench_fit [options]\n"
     "  --case NAME        only this one\n"
-    "  --mode NAME        only this one: implicit, normal, paper, paper1 or paper3\n"
+    "  --mode NAME        only this one: implicit, normal, paper, guarded2, guarded3, paper1 or paper3\n"
     "  --iterations N     steps of Adam (default 100)\n"
     "  --rate R           its rate (default 0.01)\n"
     "  --size N           pixels along a side of the picture (default 96)\n"
@@ -46,6 +46,8 @@ static const fit_mode modes[] = {
     {"implicit", DIST_TRACE_GUARDED, DIST_GRADIENT_IMPLICIT, 1},
     {"normal", DIST_TRACE_GUARDED, DIST_GRADIENT_NORMAL, 1},
     {"paper", DIST_TRACE_GUARDED, DIST_GRADIENT_PAPER, 1},
+    {"guarded3", DIST_TRACE_GUARDED, DIST_GRADIENT_PAPER, 3},
+    {"guarded2", DIST_TRACE_GUARDED, DIST_GRADIENT_PAPER, 2},
     {"paper1", DIST_TRACE_PAPER, DIST_GRADIENT_PAPER, 1},
     {"paper3", DIST_TRACE_PAPER, DIST_GRADIENT_PAPER, 3},
 };

@@ -34,7 +34,7 @@ typedef struct fit_options {
     "  --weights D,S,P    of depth, silhouette and code prior (default 10,1,1)\n"                     \
     "  --gradient WHICH   normal (default), implicit or paper; see the README\n"                      \
     "  --trace WHICH      guarded (default) or paper\n"                                               \
-    "  --samples K        samples a ray of the paper's gradient, 1 to 8 (default 1)\n"                \
+    "  --samples K        samples a ray of the paper's gradient, 1 to 8 (default 2)\n"                \
     "  --threads N        threads to use at most (default all)\n"                                     \
     "  --out STEM         files written: STEM.png, STEM_loss.svg, STEM.ply, STEM.json\n"
 

@@ -5295,8 +5295,8 @@ static int disti_ray_ask(disti_ray *ray, int mode, float q)
 }
 
 /* Bracket [a, b], fa > 0 >= fb, finished by ITP (Oliveira and Takahashi 2020): regula falsi, pushed a little toward the
-   middle and kept so near it that no more queries are needed than a bisection's plus one. So slope, clamp and kinks cannot
-   make it oscillate or crawl, and equal ends cannot divide by 0. */
+   middle and kept so near it that few more queries are needed than a bisection's. So slope, clamp and kinks cannot make
+   it oscillate or crawl, and equal ends cannot divide by 0. */
 static int disti_ray_bracket(const disti_tracer *tracer, disti_ray *ray)
 {
     float width = ray->b - ray->a, middle = 0.5f * (ray->a + ray->b);
@@ -5306,7 +5306,7 @@ static int disti_ray_bracket(const disti_tracer *tracer, disti_ray *ray)
         ray->slope = (ray->fb - ray->fa) / width;
         return disti_ray_end(ray, DIST_RAY_HIT, q, 0.0f, width);
     }
-    float room = epsilon; /* how far from the middle q may lie: what bisection would have left by now, less half the width */
+    float room = epsilon; /* how far from the middle q may lie: what bisection would have left, less half the width */
     while (room < ray->width) room *= 2.0f;
     for (int i = 0; i < ray->side; i++) room *= 0.5f;
     room = DISTI_MAX(room - 0.5f * width, 0.0f);

@@ -57,8 +57,8 @@ TEST(pfm_reads_both_byte_orders_and_kinds_of_white_space)
     static const struct {
         const char *header;
         int big;
-    } cases[] = {{"Pf\n1 1\n1.0\n", 1},   {"Pf 1 1 -1 ", 0},          {"Pf\r\n1\t1\r\n-2.5e-1\r\n", 0}, {"Pf\n1\n1\n+3\r", 1},
-                 {"Pf\n1 1\n-1.\n", 0}, {"Pf\n\n 01 001 \n-.5\n", 0}};
+    } cases[] = {{"Pf\n1 1\n1.0\n", 1}, {"Pf 1 1 -1 ", 0},     {"Pf\r\n1\t1\r\n-2.5e-1\r\n", 0},
+                 {"Pf\n1\n1\n+3\r", 1}, {"Pf\n1 1\n-1.\n", 0}, {"Pf\n\n 01 001 \n-.5\n", 0}};
     for (size_t i = 0; i < sizeof cases / sizeof cases[0]; i++) {
         unsigned char bytes[64];
         size_t n = strlen(cases[i].header);
@@ -76,11 +76,28 @@ TEST(pfm_reads_both_byte_orders_and_kinds_of_white_space)
 TEST(pfm_files_that_mean_harm_are_refused)
 {
     dist_context *ctx = test_context();
-    static const char *const files[] = {
-        "", "P", "Pf", "Pf\n", "P5\n1 1\n255\naaaa", "Pf\n1 1\n-1\n", "Pf\n1 1\n-1\naaa", "Pf\n0 1\n-1\naaaa",
-        "Pf\n-1 -1\n-1\naaaa", "Pf\n1 1\n0\naaaa", "Pf\n1 1\n-0.0\naaaa", "Pf\n1 1\nnan\naaaa", "Pf\n1 1\ninf\naaaa",
-        "Pf\n2147483647 2147483647\n-1\naaaa", "PF\n2147483647 1431655765\n-1\naaaa", "Pf\n4294967297 1\n-1\naaaa",
-        "Pf\n99999999999999999999 1\n-1\naaaa", "Pf\n1.5 1\n-1\naaaa", "Pf\n1 1\n-1aaaa", "Pf1 1\n-1\naaaa", "Pf\n1 1", "PF\n1 1\n1\naaaa"};
+    static const char *const files[] = {"",
+                                        "P",
+                                        "Pf",
+                                        "Pf\n",
+                                        "P5\n1 1\n255\naaaa",
+                                        "Pf\n1 1\n-1\n",
+                                        "Pf\n1 1\n-1\naaa",
+                                        "Pf\n0 1\n-1\naaaa",
+                                        "Pf\n-1 -1\n-1\naaaa",
+                                        "Pf\n1 1\n0\naaaa",
+                                        "Pf\n1 1\n-0.0\naaaa",
+                                        "Pf\n1 1\nnan\naaaa",
+                                        "Pf\n1 1\ninf\naaaa",
+                                        "Pf\n2147483647 2147483647\n-1\naaaa",
+                                        "PF\n2147483647 1431655765\n-1\naaaa",
+                                        "Pf\n4294967297 1\n-1\naaaa",
+                                        "Pf\n99999999999999999999 1\n-1\naaaa",
+                                        "Pf\n1.5 1\n-1\naaaa",
+                                        "Pf\n1 1\n-1aaaa",
+                                        "Pf1 1\n-1\naaaa",
+                                        "Pf\n1 1",
+                                        "PF\n1 1\n1\naaaa"};
     for (size_t i = 0; i < sizeof files / sizeof files[0]; i++) {
         int w = 7, h = 7, c = 7;
         float x = 3;
@@ -135,7 +152,8 @@ TEST(real_pfm_files_load)
     float *pixels = dist_pfm_load(ctx, path, &w, &h, &c);
     if (CHECK(pixels != NULL)) {
         CHECK(w == 128 && h == 128 && c == 1);
-        CHECK_BYTES(128 * 4, (unsigned char *)bytes + size - 128 * 4, pixels); /* the file's last row is the picture's first */
+        CHECK_BYTES(128 * 4, (unsigned char *)bytes + size - 128 * 4,
+                    pixels); /* the file's last row is the picture's first */
     }
     dist_pfm_free(ctx, pixels, w, h, c);
     free(bytes);
@@ -204,7 +222,8 @@ TEST(decimals_are_those_of_printf_and_bring_every_float_back)
         if (!CHECK_BYTES(sizeof x, &x, &again) || t.at != t.end) printf("    %s\n", (const char *)text);
         snprintf(expected, sizeof expected, "%.9g", (double)x);
         if (!(i & 1) || strchr(expected, 'e')) continue; /* printf pads exponents */
-        if (!CHECK(strcmp(expected, (const char *)text) == 0)) printf("    %s is not %s\n", (const char *)text, expected);
+        if (!CHECK(strcmp(expected, (const char *)text) == 0))
+            printf("    %s is not %s\n", (const char *)text, expected);
     }
 }
 
@@ -241,15 +260,19 @@ TEST(normals_are_written_to_both_formats)
 
 static const char *const good_files[] = {
     "ply\nformat ascii 1.0\ncomment x\nelement vertex 4\nproperty float x\nproperty float y\nproperty double z\n"
-    "property float quality\nelement face 1\nproperty list uchar int vertex_indices\nproperty uchar flag\nelement edge 1\n"
+    "property float quality\nelement face 1\nproperty list uchar int vertex_indices\nproperty uchar flag\nelement edge "
+    "1\n"
     "property int a\nend_header\n0 0 0 nan\n1 0 0 1\n1 1 0 1\n0 1 0 1\n4 0 1 2 3 9\n5\n",
-    "ply\r\nformat ascii 1.0\r\nelement vertex 4\r\nproperty float32 y\r\nproperty float32 x\r\nproperty float32 z\r\nelement void "
-    "99999999999\r\nelement face 2\r\nproperty list uint8 uint32 vertex_index\r\nend_header\r\n0 0 0\r\n0 1 0\r\n1 1 0\r\n1 0 0\r\n"
+    "ply\r\nformat ascii 1.0\r\nelement vertex 4\r\nproperty float32 y\r\nproperty float32 x\r\nproperty float32 "
+    "z\r\nelement void "
+    "99999999999\r\nelement face 2\r\nproperty list uint8 uint32 vertex_index\r\nend_header\r\n0 0 0\r\n0 1 0\r\n1 1 "
+    "0\r\n1 0 0\r\n"
     "3 0 1 2\r\n3 0 2 3",
     "OFF\n4 1 4\n0 0 0\n1 0 0\n\n# comment\n1 1 0 # more\n0 1 0\n4 0 1 2 3 255 0 0\n",
     "OFF 4 2 0\r\n0 0 0\r\n1 0 0\r\n1 1 0\r\n0 1 0\r\n3 0 1 2\r\n3 0 2 3\r\n",
     "COFF\n4 1 0\n0 0 0 1 1 1 1\n1 0 0 1 1 1 1\n1 1 0 1 1 1 1\n0 1 0 1 1 1 1\n4 0 1 2 3\n",
-    "# obj\nmtllib a.mtl\nv 0 0 0\nv 1. 0 0 1.0\nvt 0 0\nvn 0 0 1\nv 1 1e0 -0.0\nv .0 +1 0\nusemtl a\nf 1/1/1 2//1 3/1 4\n",
+    "# obj\nmtllib a.mtl\nv 0 0 0\nv 1. 0 0 1.0\nvt 0 0\nvn 0 0 1\nv 1 1e0 -0.0\nv .0 +1 0\nusemtl a\nf 1/1/1 2//1 3/1 "
+    "4\n",
     "v 0 0 0\nv 1 0 0\nv 1 1 0\nf -3 -2 -1 4\nv 0 1 0",
     "f 1 2 3\nf 1 3 4\nf 1 2\nf\n  v 0 0 0\n\tv\t1\t0\t0\r\nv 1 1 0 0.5 0.5 0.5\nv 0 1 0 # end\n"};
 enum { GOOD_FILES = sizeof good_files / sizeof good_files[0] };
@@ -276,9 +299,10 @@ TEST(every_dialect_reads_as_the_same_square)
 TEST(binary_ply_of_mixed_types_is_read)
 {
     dist_context *ctx = test_context();
-    static const char header[] = "ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty short skip\nproperty double x\n"
-                                 "property float y\nproperty double z\nelement face 1\nproperty list ushort short vertex_indices\n"
-                                 "end_header\n";
+    static const char header[] =
+        "ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty short skip\nproperty double x\n"
+        "property float y\nproperty double z\nelement face 1\nproperty list ushort short vertex_indices\n"
+        "end_header\n";
     unsigned char bytes[sizeof header + 200];
     size_t n = sizeof header - 1;
     memcpy(bytes, header, n);
@@ -319,18 +343,49 @@ TEST(mesh_files_that_mean_harm_are_refused_with_a_sentence)
 {
     dist_context *ctx = test_context();
     static const char *const files[] = {
-        "", "\n", "ply", "ply\n", "OFF", "OFF\n", "OFF BINARY\n", "OFF\n1 1 0\n0 0 0\n", "OFF\n3 1 0\n0 0 0\n0 0 0\n0 0 0\n3 0 1 3\n",
-        "OFF\n3 1 0\n0 0 0\n0 0 0\n0 0 0\n3 0 1 -1\n", "OFF\n3 1 0\n0 0 0\n0 0 0\n0 0 0\n3 0 1 1.5\n", "OFF\n1 0 0\nnan 0 0\n",
-        "OFF\n1 0 0\n1e39 0 0\n", "OFF\n1 0 0\n1e999 0 0\n", "OFF\n99999999999999 1 0\n1 2 3\n", "OFF\n1 99999999999999 0\n1 2 3\n",
-        "OFF\n1 1 0\n1 2 3\n1e300 0 0 0\n", "v 0 0\n", "v 0 0 x\n", "v inf 0 0\n", "v nan 0 0\n", "v 0 0 0\nf 1 1 2\n", "v 0 0 0\nf 1 1 0\n",
-        "v 0 0 0\nf -1 -1 -2\n", "v 0 0 0\nf a b c\n", "v 0 0 0\nf 1 1 99999999999999999999\n", "v 0 0 0\nf 1 1 1.5\n", "just text",
-        "v 0 0 0\nf 1 1 4294967297\n", PLY "element vertex 1\n" XYZ, PLY "element vertex 1\n" XYZ "end_header\n0 0\n",
-        PLY "element vertex 1\nproperty float x\nend_header\n0\n", PLY "element vertex -1\n" XYZ "end_header\n",
-        PLY "element vertex x\n" XYZ "end_header\n", PLY "property float x\nend_header\n", PLY "element vertex 1\nproperty blob x\n",
+        "",
+        "\n",
+        "ply",
+        "ply\n",
+        "OFF",
+        "OFF\n",
+        "OFF BINARY\n",
+        "OFF\n1 1 0\n0 0 0\n",
+        "OFF\n3 1 0\n0 0 0\n0 0 0\n0 0 0\n3 0 1 3\n",
+        "OFF\n3 1 0\n0 0 0\n0 0 0\n0 0 0\n3 0 1 -1\n",
+        "OFF\n3 1 0\n0 0 0\n0 0 0\n0 0 0\n3 0 1 1.5\n",
+        "OFF\n1 0 0\nnan 0 0\n",
+        "OFF\n1 0 0\n1e39 0 0\n",
+        "OFF\n1 0 0\n1e999 0 0\n",
+        "OFF\n99999999999999 1 0\n1 2 3\n",
+        "OFF\n1 99999999999999 0\n1 2 3\n",
+        "OFF\n1 1 0\n1 2 3\n1e300 0 0 0\n",
+        "v 0 0\n",
+        "v 0 0 x\n",
+        "v inf 0 0\n",
+        "v nan 0 0\n",
+        "v 0 0 0\nf 1 1 2\n",
+        "v 0 0 0\nf 1 1 0\n",
+        "v 0 0 0\nf -1 -1 -2\n",
+        "v 0 0 0\nf a b c\n",
+        "v 0 0 0\nf 1 1 99999999999999999999\n",
+        "v 0 0 0\nf 1 1 1.5\n",
+        "just text",
+        "v 0 0 0\nf 1 1 4294967297\n",
+        PLY "element vertex 1\n" XYZ,
+        PLY "element vertex 1\n" XYZ "end_header\n0 0\n",
+        PLY "element vertex 1\nproperty float x\nend_header\n0\n",
+        PLY "element vertex -1\n" XYZ "end_header\n",
+        PLY "element vertex x\n" XYZ "end_header\n",
+        PLY "property float x\nend_header\n",
+        PLY "element vertex 1\nproperty blob x\n",
         PLY "element vertex 1\n" XYZ "property list float int vertex_indices\nend_header\n",
-        PLY "element vertex 1\n" XYZ "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n3 0 0 1\n",
-        PLY "element vertex 1\n" XYZ "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n4000000000 0 0 0\n",
-        PLY "element vertex 4000000000\n" XYZ "end_header\n0 0 0\n", PLY "element vertex 99999999999999999999\n" XYZ "end_header\n",
+        PLY "element vertex 1\n" XYZ
+            "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n3 0 0 1\n",
+        PLY "element vertex 1\n" XYZ
+            "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n4000000000 0 0 0\n",
+        PLY "element vertex 4000000000\n" XYZ "end_header\n0 0 0\n",
+        PLY "element vertex 99999999999999999999\n" XYZ "end_header\n",
         "ply\nformat binary_big_endian 1.0\nelement vertex 0\n" XYZ "end_header\n",
         "ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\n" XYZ "end_header\n0123456789ab"};
     for (size_t i = 0; i < sizeof files / sizeof files[0]; i++) {
@@ -524,7 +579,8 @@ TEST(every_allocation_of_reading_and_saving_may_fail)
         a.fail_at = a.requests + n;
         dist_mesh *mesh = files_text(ctx, good_files[n % GOOD_FILES]);
         if (mesh && dist_mesh_save(ctx, mesh, path) == DIST_OK) back = dist_mesh_load(ctx, path);
-        if (back && dist_pfm_save(ctx, path, 2, 2, 1, pixels) == DIST_OK) picture = dist_pfm_load(ctx, path, &w, &h, &c);
+        if (back && dist_pfm_save(ctx, path, 2, 2, 1, pixels) == DIST_OK)
+            picture = dist_pfm_load(ctx, path, &w, &h, &c);
         done = picture != NULL;
         if (!done) CHECK_STATUS(DIST_OUT_OF_MEMORY, dist_context_status(ctx), ctx);
         dist_pfm_free(ctx, picture, w, h, c);

@@ -263,7 +263,8 @@ TEST(skipping_changes_no_bit_and_saves_most_queries)
         CHECK(skipping * 3 < queries);
         CHECK(mesh_closed(a));
         if (CHECK_EQUAL(b->vertex_count, a->vertex_count)) CHECK_BYTES(a->vertex_count * 12, b->vertices, a->vertices);
-        if (CHECK_EQUAL(b->triangle_count, a->triangle_count)) CHECK_BYTES(a->triangle_count * 12, b->triangles, a->triangles);
+        if (CHECK_EQUAL(b->triangle_count, a->triangle_count))
+            CHECK_BYTES(a->triangle_count * 12, b->triangles, a->triangles);
         dist_mesh_destroy(a);
         dist_mesh_destroy(b);
     }

@@ -6124,8 +6124,7 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
 /* Soft silhouette of the rays that miss: min |f| along each. Cones and stretched steps leave no sample near the
    minimum, so it is looked for: one ray of each 4 x 4 block that has no sample samples its whole length; its
    neighbors start at the distance found there; then every ray fits a parabola through three samples around its best
-   one. A value off by ds costs ds^2 / 2 times the curvature: first-order exact                                      
-               (envelope theorem) */
+   one. A value off by ds costs ds^2 / 2 times the curvature: first-order exact (envelope theorem). */
 static int disti_wants_minimum(const disti_ray *ray)
 {
     return ray->status == DIST_RAY_MISS && ray->enter < ray->leave;

@@ -274,8 +274,8 @@ static double least_along(const test_shape *shape, const double o[3], const doub
     return fmin(least, shape_along(shape, o, d, 0.5 * (low + high)));
 }
 
-/* Misses whose smallest f is below `reach` and whose value is off by more than 5e-3: at most `percent` of them. Where f has
-   several minima along a ray, or a kinked one, the value can be that of another. */
+/* Misses whose smallest f is below `reach` and whose value is off by more than 5e-3: at most `percent` of them. Where f
+   has several minima along a ray, or a kinked one, the value can be that of another. */
 static void check_silhouette(double reach, int percent)
 {
     dist_context *ctx = shape_context();

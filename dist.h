@@ -721,7 +721,7 @@ struct dist_context {
 /* Each worker's scratch: counters, then the tracer's part, then the field's. */
 enum {
     DISTI_COUNTER_BYTES = 64,
-    DISTI_TRACE_BYTES = 704 * 1024,
+    DISTI_TRACE_BYTES = 832 * 1024,
     DISTI_FIELD_OFFSET = DISTI_COUNTER_BYTES + DISTI_TRACE_BYTES
 };
 /* Sums that must not depend on the number of threads are kept in this many slots. */
@@ -5207,12 +5207,14 @@ static dist_status disti_how_check(dist_context *ctx, const dist_render_desc *ho
     return DIST_OK;
 }
 
+#if !defined(DIST_NO_PAPER) || !defined(DIST_NO_BACKWARD)
 /* alpha of a paper row: the two plain ones step by f itself. */
 static float disti_paper_alpha(const dist_render_desc *how)
 {
     return how->paper_row == DIST_PAPER_COARSE_TO_FINE || how->paper_row == DIST_PAPER_AGGRESSIVE ? how->step_scale
                                                                                                   : 1.0f;
 }
+#endif
 
 static dist_status disti_tracer_init(disti_tracer *tracer, dist_context *ctx, const dist_field *field,
                                      const dist_render_desc *desc, const char *function)

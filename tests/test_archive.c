@@ -2,6 +2,9 @@
    test_archive.c - the safetensors reader and writer, and the numbers of its metadata */
 #include "test.h"
 
+#define LESSER(a, b) ((a) < (b) ? (a) : (b))
+#define GREATER(a, b) ((a) > (b) ? (a) : (b))
+
 /* ---- help -------------------------------------------------------------------------------------------------------- */
 
 static dist_context *archive_context(test_allocator *a)
@@ -743,11 +746,11 @@ static size_t fuzz_mutate(test_random *r, unsigned char *bytes, size_t size, siz
     case 1: bytes[at] = (unsigned char)test_random_int(r, 0, 255); break;
     case 2: return at;
     case 3: /* copies one piece over another */
-        length = DISTI_MIN(piece, size - DISTI_MAX(at, from));
+        length = LESSER(piece, size - GREATER(at, from));
         memmove(bytes + at, bytes + from, length);
         break;
     case 4: /* a piece goes; the header's length follows */
-        length = DISTI_MIN(piece, size - at);
+        length = LESSER(piece, size - at);
         memmove(bytes + at, bytes + at + length, size - at - length);
         if (at >= 8) bytes[0] = (unsigned char)(bytes[0] - length);
         return size - length;

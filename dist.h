@@ -361,7 +361,7 @@ typedef struct dist_render_desc {
     int samples;         /* K of the paper's gradient, 1 to 8; 0: 1 */
     int trace;           /* DIST_TRACE_* */
     int paper_row;       /* DIST_PAPER_* */
-    int gradient;        /* DIST_GRADIENT_*; AUTO: PAPER, which fitted best where measured (README) */
+    int gradient;        /* DIST_GRADIENT_*; AUTO: IMPLICIT with the guarded tracer, PAPER with the paper's */
     float gradient_cap;  /* tau: |grad f . v| counts as at least tau |grad f|; 0: 0.1 */
     int normal_mode;     /* DIST_NORMAL_* */
     float normal_delta;  /* half step of differences, shape units; 0: 1e-3 of the bounding radius */
@@ -1816,8 +1816,8 @@ static disti_kernels disti_kernels_for(int isa)
 /* exp to 2 ulp; below -87 it is 0, above 88 the largest float. */
 static float disti_exp(float x)
 {
-    x = x > 88.0f ? 88.0f : x;
-    x = x < -87.0f ? -87.0f : x;
+    x = x < 88.0f ? x : 88.0f; /* also for NaN, which may stand in idle lanes */
+    x = x > -87.0f ? x : -87.0f;
     float n = x * 1.44269504f;
     int32_t k = (int32_t)(n < 0.0f ? n - 0.5f : n + 0.5f);
     n = (float)k;
@@ -3462,6 +3462,7 @@ static void disti_net_output(const dist_shape *shape, const disti_block *b, cons
                 b->columns, value);
     for (size_t c = 0; c < DISTI_BLOCK; c++) {
         float v = value[c], d = 1.0f;
+        slope[c] = 0.0f;
         if (net->output == DISTI_OUTPUT_TANH || net->output == DISTI_OUTPUT_TANH_TWICE) {
             d = disti_tanh_slope(v);
             v = disti_tanh(v);
@@ -3474,6 +3475,7 @@ static void disti_net_output(const dist_shape *shape, const disti_block *b, cons
             d = disti_sigmoid_slope(v);
             v = disti_sigmoid(v);
         }
+        if (!disti_finite(value[c])) continue; /* stays what it is: the ray is told */
         value[c] = channel == net->sdf_channel ? v - net->level : v;
         slope[c] = d;
     }
@@ -5146,7 +5148,8 @@ DIST_API dist_render_desc dist_render_desc_resolve(const dist_render_desc *desc)
     if (how.step_scale == 0.0f) how.step_scale = 1.5f;
     if (how.epsilon == 0.0f && how.trace == DIST_TRACE_PAPER) how.epsilon = 5e-5f;
     if (how.samples == 0) how.samples = 1;
-    if (how.gradient == DIST_GRADIENT_AUTO) how.gradient = DIST_GRADIENT_PAPER;
+    if (how.gradient == DIST_GRADIENT_AUTO)
+        how.gradient = how.trace == DIST_TRACE_PAPER ? DIST_GRADIENT_PAPER : DIST_GRADIENT_IMPLICIT;
     if (how.gradient_cap == 0.0f) how.gradient_cap = 0.1f;
     if (how.normal_delta == 0.0f) how.normal_delta = 1e-3f;
     return how;

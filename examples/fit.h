@@ -46,6 +46,7 @@ static inline fit_options fit_defaults(void)
     f.keep = 100.0;
     f.seed = 1;
     f.iterations = 100;
+    f.how.gradient = DIST_GRADIENT_PAPER; /* with two samples: see the README's table */
     f.how.samples = 2;
     f.rate = 0.01f;
     f.weights[0] = 10.0f;

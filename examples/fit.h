@@ -32,7 +32,7 @@ typedef struct fit_options {
     "  --iterations N     steps of Adam (default 100)\n"                                              \
     "  --rate R           its rate (default 0.01)\n"                                                  \
     "  --weights D,S,P    of depth, silhouette and code prior (default 10,1,1)\n"                     \
-    "  --gradient WHICH   normal (default), implicit or paper; see the README\n"                      \
+    "  --gradient WHICH   paper (default), implicit, normal or auto; see the README\n"               \
     "  --trace WHICH      guarded (default) or paper\n"                                               \
     "  --samples K        samples a ray of the paper's gradient, 1 to 8 (default 2)\n"                \
     "  --threads N        threads to use at most (default all)\n"                                     \

@@ -4180,7 +4180,6 @@ static const disti_tensor *disti_loader_find(const disti_loader *loader, const c
 
 static dist_status disti_loader_bad(const disti_loader *loader, const char *key)
 {
-    (void)loader->function;
     const char *value = disti_archive_meta(&loader->archive, key);
     char text[160];
     size_t n = 0;
@@ -5679,7 +5678,7 @@ static float disti_covered(const disti_bench *bench, int index, const disti_ray 
 }
 
 /* Moves a ray that is about to step past what is known to be empty. 0: it is through. */
-static int disti_skip(const disti_tracer *tracer, const disti_bench *bench, int index, disti_ray *ray)
+static int disti_skip(const disti_bench *bench, int index, disti_ray *ray)
 {
     if (ray->mode != DISTI_FIRST && ray->mode != DISTI_MARCH && ray->mode != DISTI_SKIP) return 1;
     int begins = ray->mode == DISTI_FIRST;
@@ -5689,7 +5688,6 @@ static int disti_skip(const disti_tracer *tracer, const disti_bench *bench, int 
     ray->q = s;
     if (begins) ray->start = s;
     else ray->mode = DISTI_SKIP;
-    (void)tracer;
     return 1;
 }
 
@@ -5700,7 +5698,7 @@ static void disti_trace_rounds(const disti_tracer *tracer, int worker, const dis
         size_t kept = 0;
         for (size_t i = 0; i < active; i++) {
             disti_ray *ray = &bench->rays[bench->index[i]];
-            if (bench->balls && !disti_skip(tracer, bench, bench->index[i], ray)) continue;
+            if (bench->balls && !disti_skip(bench, bench->index[i], ray)) continue;
             disti_ray_point(ray, ray->q, bench->points + 3 * kept);
             bench->index[kept++] = bench->index[i];
         }
@@ -6655,7 +6653,6 @@ static float disti_ray_silhouette(const disti_tracer *tracer, const disti_ray *r
     if (ray->status == DIST_RAY_NOT_FINITE) return epsilon;
     if (disti_ray_is_hit(tracer, ray))
         return DISTI_MIN((tracer->how.trace == DIST_TRACE_PAPER ? f : magnitude) - epsilon, -tiny);
-    if (tracer->how.trace == DIST_TRACE_PAPER) return DISTI_MAX(magnitude - epsilon, tiny);
     return DISTI_MAX(magnitude - epsilon, tiny);
 }
 

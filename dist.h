@@ -6943,9 +6943,7 @@ static float disti_backward_normal(disti_render_backward_job *job, const disti_r
         seeds[k] = (float)(side * (count == 2 ? pull : u[k / 2]) / (2.0 * h));
     }
     if (tracer->how.gradient != DIST_GRADIENT_PAPER) {
-        unsigned state = disti_float_state_enter();
         field->eval_fn(field->user, 0, count, points, values, slopes);
-        disti_float_state_leave(state);
         for (size_t k = 0; k < count; k++)
             for (size_t i = 0; i < 3; i++) motion += seeds[k] * slopes[3 * k + i] * ray->direction[i];
     }
@@ -7071,7 +7069,9 @@ DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *ta
         job.d_code = ctx->partial + (size_t)DISTI_SLOTS * size;
         memset(job.d_code, 0, size * sizeof(double));
     }
+    unsigned state = disti_float_state_enter(); /* the normals' share is evaluated outside disti_run */
     if (grads->code || grads->weights || job.pose) disti_backward_pixels(&job);
+    disti_float_state_leave(state);
     for (size_t j = 0; grads->code && j < size; j++) grads->code[j] += (float)job.d_code[j];
     for (int i = 0; i < 3; i++) {
         if (grads->rotation) grads->rotation[i] += (float)job.rotation[i];

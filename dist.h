@@ -2542,7 +2542,7 @@ static int disti_json_sizes(disti_reader *r, const char *field, int *rank, size_
 static size_t disti_dtype_size(const char *name, int *dtype)
 {
     static const struct {
-        const char *name;
+        char name[12];
         size_t size;
         int dtype;
     } known[] = {{"F32", 4, DISTI_F32}, {"F16", 2, DISTI_F16}, {"BF16", 2, DISTI_BF16},
@@ -2559,7 +2559,7 @@ static size_t disti_dtype_size(const char *name, int *dtype)
 /* The value of a tensor's name: exactly dtype, shape and data_offsets, in any order. */
 static int disti_archive_tensor(disti_reader *r, disti_tensor *tensor)
 {
-    static const char *const fields[3] = {"dtype", "shape", "data_offsets"};
+    static const char fields[3][16] = {"dtype", "shape", "data_offsets"};
     char text[32];
     size_t length, offsets[4], product, element = 0;
     int found[3] = {0, 0, 0}, offset_count = 0;
@@ -2764,7 +2764,7 @@ static const unsigned char *disti_utf8_end(const unsigned char *c, const unsigne
 /* Finds header and data. What is not safetensors at all is named, where its first bytes tell. */
 static int disti_archive_header(disti_reader *r, size_t size)
 {
-    static const char *const others[5][2] = {
+    static const char others[5][2][37] = {
         {"PK\3\4", "a PyTorch checkpoint (zip)"}, {"\x80", "a PyTorch checkpoint (pickle)"}, {"GGUF", "a GGUF file"},
         {"\x93NUMPY", "a numpy file"}, {"\x89HDF", "an HDF5 file"}};
     uint64_t length = 0;
@@ -4228,7 +4228,7 @@ static int disti_loader_choice(const disti_loader *loader, const char *key, cons
 
 static dist_status disti_loader_activation(disti_loader *loader)
 {
-    static const char *const names[6] = {"relu", "elu", "softplus", "sine", "tanh", "none"};
+    static const char names[6][12] = {"relu", "elu", "softplus", "sine", "tanh", "none"};
     dist_net *net = loader->net;
     const char *s = disti_archive_meta(&loader->archive, "dist.activation");
     double first = 1.0, other;
@@ -4524,9 +4524,9 @@ static void disti_saver_number(disti_saver *s, const char *key, const char *befo
 
 static void disti_saver_meta(disti_saver *s, const dist_net *net)
 {
-    static const char *const activations[6] = {"relu", "elu", "softplus:", "sine:", "tanh", "none"};
-    static const char *const outputs[4] = {"none", "tanh", "sigmoid", "tanh:2"};
-    static const char *const orders[3] = {"sin,cos", "cos_all,sin_all", "sin_all,cos_all"};
+    static const char activations[6][12] = {"relu", "elu", "softplus:", "sine:", "tanh", "none"};
+    static const char outputs[4][8] = {"none", "tanh", "sigmoid", "tanh:2"};
+    static const char orders[3][16] = {"sin,cos", "cos_all,sin_all", "sin_all,cos_all"};
     float skip_scale = 1.0f;
     char *skip = s->text, *channels;
     memset(s, 0, sizeof *s);
@@ -4575,7 +4575,7 @@ static void disti_saver_meta(disti_saver *s, const dist_net *net)
 DIST_API dist_status dist_net_save(dist_context *ctx, const dist_net *net, void *buffer, size_t capacity, size_t *size)
 {
     enum { MOST = 4 * DISTI_MAX_LAYERS + 1 };
-    static const char *const endings[4] = {".weight", ".bias", ".weight", ".bias"};
+    static const char endings[4][8] = {".weight", ".bias", ".weight", ".bias"};
     disti_tensor_out tensors[MOST];
     char names[MOST][16];
     disti_saver saver;
@@ -8559,7 +8559,7 @@ static int disti_ply_word(disti_text *t, const char *word)
 
 static int disti_ply_type(disti_text *t)
 {
-    static const char *const names[16] = {"char", "int8", "uchar", "uint8", "short", "int16", "ushort", "uint16",
+    static const char names[16][8] = {"char", "int8", "uchar", "uint8", "short", "int16", "ushort", "uint16",
                                           "int", "int32", "uint", "uint32", "float", "float32", "double", "float64"};
     for (int i = 0; i < 16; i++)
         if (disti_ply_word(t, names[i])) return i / 2;

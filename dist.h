@@ -8116,41 +8116,15 @@ DIST_API dist_status dist_chamfer(dist_context *ctx, size_t n, const float *a, s
 
 /*@ 12 files -------------------------------------------------------------------------------------------------------- */
 
-/* Where a file in memory is written: counts always, stores while out is not NULL. */
-typedef struct disti_sink {
-    unsigned char *out;
-    size_t size; /* SIZE_MAX: it does not fit */
-} disti_sink;
-
-static void disti_sink_bytes(disti_sink *sink, const void *bytes, size_t n)
-{
-    if (sink->out) memcpy(sink->out + sink->size, bytes, n);
-    disti_size_add(sink->size, n, &sink->size);
-}
-
-static void disti_sink_text(disti_sink *sink, const char *text)
-{
-    disti_sink_bytes(sink, text, strlen(text));
-}
-
-static void disti_sink_integer(disti_sink *sink, size_t x)
-{
-    char text[24];
-    size_t at = sizeof text;
-    do text[--at] = (char)('0' + (int)(x % 10u));
-    while ((x /= 10u) != 0);
-    disti_sink_bytes(sink, text + at, sizeof text - at);
-}
-
 /* Little-endian on every machine. */
-static void disti_sink_word(disti_sink *sink, uint32_t x)
+static void disti_sink_word(disti_writer *sink, uint32_t x)
 {
     unsigned char bytes[4];
     for (int i = 0; i < 4; i++) bytes[i] = (unsigned char)(x >> 8 * i & 255u);
-    disti_sink_bytes(sink, bytes, sizeof bytes);
+    disti_put(sink, bytes, sizeof bytes);
 }
 
-static void disti_sink_float(disti_sink *sink, float x)
+static void disti_sink_float(disti_writer *sink, float x)
 {
     uint32_t bits;
     memcpy(&bits, &x, sizeof bits);
@@ -8230,18 +8204,18 @@ DIST_API dist_status dist_pfm_write(dist_context *ctx, int width, int height, in
 {
     const char *name = "dist_pfm_write";
     size_t floats = 0;
-    disti_sink sink;
+    disti_writer sink;
     unsigned char header[64];
     dist_status status = disti_pfm_check(ctx, name, width, height, channels, &floats);
     if (status != DIST_OK) return status;
     if (!size) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: size is NULL", name, 0, 0);
     sink.out = header;
     sink.size = 0;
-    disti_sink_text(&sink, channels == 3 ? "PF\n" : "Pf\n");
-    disti_sink_integer(&sink, (size_t)width);
-    disti_sink_text(&sink, " ");
-    disti_sink_integer(&sink, (size_t)height);
-    disti_sink_text(&sink, "\n-1.0\n"); /* negative: little-endian */
+    disti_put_text(&sink, channels == 3 ? "PF\n" : "Pf\n");
+    disti_put_size(&sink, (size_t)width);
+    disti_put_text(&sink, " ");
+    disti_put_size(&sink, (size_t)height);
+    disti_put_text(&sink, "\n-1.0\n"); /* negative: little-endian */
     *size = sink.size + 4 * floats;
     if (!buffer) return DIST_OK;
     if (!pixels) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: pixels is NULL", name, 0, 0);
@@ -8743,7 +8717,7 @@ DIST_API dist_mesh *dist_mesh_read(dist_context *ctx, const void *bytes, size_t 
 }
 
 /* Nine significant digits bring every float back; as printf's %.9g writes it, but in no locale. */
-static void disti_sink_decimal(disti_sink *sink, float number)
+static void disti_sink_decimal(disti_writer *sink, float number)
 {
     char text[32], digits[9];
     size_t n = 0;
@@ -8771,60 +8745,60 @@ static void disti_sink_decimal(disti_sink *sink, float number)
         text[n++] = i <= last ? digits[i] : '0';
         if (i == point && i < last) text[n++] = '.';
     }
-    disti_sink_bytes(sink, text, n);
+    disti_put(sink, text, n);
     if (plain) return;
-    disti_sink_text(sink, exponent < 0 ? "e-" : "e");
-    disti_sink_integer(sink, (size_t)(exponent < 0 ? -exponent : exponent));
+    disti_put_text(sink, exponent < 0 ? "e-" : "e");
+    disti_put_size(sink, (size_t)(exponent < 0 ? -exponent : exponent));
 }
 
-static void disti_write_ply(disti_sink *sink, const dist_mesh *mesh)
+static void disti_write_ply(disti_writer *sink, const dist_mesh *mesh)
 {
-    disti_sink_text(sink, "ply\nformat binary_little_endian 1.0\nelement vertex ");
-    disti_sink_integer(sink, mesh->vertex_count);
-    disti_sink_text(sink, "\nproperty float x\nproperty float y\nproperty float z\n");
-    if (mesh->normals) disti_sink_text(sink, "property float nx\nproperty float ny\nproperty float nz\n");
-    disti_sink_text(sink, "element face ");
-    disti_sink_integer(sink, mesh->triangle_count);
+    disti_put_text(sink, "ply\nformat binary_little_endian 1.0\nelement vertex ");
+    disti_put_size(sink, mesh->vertex_count);
+    disti_put_text(sink, "\nproperty float x\nproperty float y\nproperty float z\n");
+    if (mesh->normals) disti_put_text(sink, "property float nx\nproperty float ny\nproperty float nz\n");
+    disti_put_text(sink, "element face ");
+    disti_put_size(sink, mesh->triangle_count);
     /* some programs read only int; uint where it is needed */
-    disti_sink_text(sink,
+    disti_put_text(sink,
                     mesh->vertex_count > 0x7fffffffu ? "\nproperty list uchar uint" : "\nproperty list uchar int");
-    disti_sink_text(sink, " vertex_indices\nend_header\n");
+    disti_put_text(sink, " vertex_indices\nend_header\n");
     for (size_t i = 0; i < mesh->vertex_count; i++) {
         for (size_t k = 0; k < 3; k++) disti_sink_float(sink, mesh->vertices[3 * i + k]);
         for (size_t k = 0; mesh->normals && k < 3; k++) disti_sink_float(sink, mesh->normals[3 * i + k]);
     }
     for (size_t i = 0; i < mesh->triangle_count; i++) {
-        disti_sink_bytes(sink, "\003", 1);
+        disti_put(sink, "\003", 1);
         for (size_t k = 0; k < 3; k++) disti_sink_word(sink, mesh->triangles[3 * i + k]);
     }
 }
 
-static void disti_write_obj_vectors(disti_sink *sink, const char *letter, size_t n, const float *vectors)
+static void disti_write_obj_vectors(disti_writer *sink, const char *letter, size_t n, const float *vectors)
 {
     for (size_t i = 0; i < n; i++) {
-        disti_sink_text(sink, letter);
+        disti_put_text(sink, letter);
         for (size_t k = 0; k < 3; k++) {
-            disti_sink_text(sink, " ");
+            disti_put_text(sink, " ");
             disti_sink_decimal(sink, vectors[3 * i + k]);
         }
-        disti_sink_text(sink, "\n");
+        disti_put_text(sink, "\n");
     }
 }
 
-static void disti_write_obj(disti_sink *sink, const dist_mesh *mesh)
+static void disti_write_obj(disti_writer *sink, const dist_mesh *mesh)
 {
     disti_write_obj_vectors(sink, "v", mesh->vertex_count, mesh->vertices);
     if (mesh->normals) disti_write_obj_vectors(sink, "vn", mesh->vertex_count, mesh->normals);
     for (size_t i = 0; i < mesh->triangle_count; i++) {
-        disti_sink_text(sink, "f");
+        disti_put_text(sink, "f");
         for (size_t k = 0; k < 3; k++) {
-            disti_sink_text(sink, " ");
-            disti_sink_integer(sink, (size_t)mesh->triangles[3 * i + k] + 1);
+            disti_put_text(sink, " ");
+            disti_put_size(sink, (size_t)mesh->triangles[3 * i + k] + 1);
             if (!mesh->normals) continue;
-            disti_sink_text(sink, "//");
-            disti_sink_integer(sink, (size_t)mesh->triangles[3 * i + k] + 1);
+            disti_put_text(sink, "//");
+            disti_put_size(sink, (size_t)mesh->triangles[3 * i + k] + 1);
         }
-        disti_sink_text(sink, "\n");
+        disti_put_text(sink, "\n");
     }
 }
 
@@ -8832,7 +8806,7 @@ DIST_API dist_status dist_mesh_write(dist_context *ctx, const dist_mesh *mesh, i
                                      size_t capacity, size_t *size)
 {
     const char *name = "dist_mesh_write";
-    disti_sink sink;
+    disti_writer sink;
     dist_status status = disti_enter(ctx, name);
     if (status != DIST_OK) return status;
     if (!mesh || !size)

@@ -208,7 +208,7 @@ TEST(decimals_are_those_of_printf_and_bring_every_float_back)
         if (i & 1) x = (float)test_random_int(&r, -100000, 100000) / (i & 2 ? 1000.0f : 1.0f);
         unsigned char text[64];
         char expected[64];
-        disti_sink sink;
+        disti_writer sink;
         double back = 0;
         if (!test_finite((double)x)) continue;
         sink.out = text;

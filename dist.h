@@ -164,6 +164,11 @@ DIST_API int dist_context_workers(const dist_context *ctx);
 
 /* ---- 04 field ---------------------------------------------------------------------------------------------------- */
 
+/* Tells d_sdf (count) for points first..first+count-1 once their sdf (count) and gradient (count, 3) are known;
+   gradient is NULL where weights' gradients are wanted. Called from several workers at once. */
+typedef void (*dist_seed_fn)(void *seed_user, size_t first, size_t count, const float *sdf, const float *gradient,
+                             float *d_sdf);
+
 /* What is traced: a function of the point that is negative inside, positive outside, zero on the surface, within a
    bounding sphere. Yours, an analytic one below, or a network (dist_shape_field). A plain value: copy it freely.
    The callbacks must not call functions of this library with the same context. */
@@ -177,13 +182,10 @@ typedef struct dist_field {
     /* Set by dist_shape_field, NULL in a field of your own: value, gradient and code adjoint in one pass, and the
        weights'. */
     void (*fused_fn)(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient,
-                     void (*seed_fn)(void *seed_user, size_t first, size_t count, const float *sdf,
-                                     const float *gradient, float *d_sdf),
-                     void *seed_user, double *d_code);
+                     dist_seed_fn seed_fn, void *seed_user, double *d_code);
     dist_status (*weights_fn)(void *user, dist_context *ctx, size_t n, const float *points, float *d_sdf,
-                              void (*seed_fn)(void *seed_user, size_t first, size_t count, const float *sdf,
-                                              const float *gradient, float *d_sdf),
-                              void *seed_user, float *d_points, double *d_code, float *d_weights);
+                              dist_seed_fn seed_fn, void *seed_user, float *d_points, double *d_code,
+                              float *d_weights);
     /* color (n, 3) at n points. NULL: this field has no color. */
     void (*color_fn)(void *user, int worker, size_t n, const float *points, float *color);
     float center[3]; /* bounding sphere: the surface lies inside it, nothing is looked for outside */
@@ -217,7 +219,6 @@ typedef struct dist_gradients {
     float *weights;     /* (field.weight_count), the order of dist_net_weights */
 } dist_gradients;
 
-/* Tells d_sdf (count) for points first..first+count-1 once their sdf (count) and gradient (count, 3) are known;
    gradient is NULL where grads->weights is wanted. Called from several workers at once. */
 typedef void (*dist_seed_fn)(void *seed_user, size_t first, size_t count, const float *sdf, const float *gradient,
                              float *d_sdf);
@@ -1026,6 +1027,16 @@ static dist_status disti_scratch_reserve(dist_context *ctx, size_t bytes)
 static unsigned char *disti_scratch(const dist_context *ctx, int worker)
 {
     return ctx->scratch + ctx->scratch_bytes * (size_t)worker;
+}
+
+/* The next `count` things of `size` bytes in a block of memory; base NULL: only *at moves on. */
+static void *disti_take(unsigned char *base, size_t *at, size_t count, size_t size)
+{
+    size_t bytes = (count * size + DISTI_ALIGNMENT - 1) &
+                   ~(size_t)(DISTI_ALIGNMENT - 1); /* small factors: cannot overflow */
+    unsigned char *p = base ? base + *at : NULL;
+    *at += bytes;
+    return p;
 }
 
 static disti_counter *disti_counter_of(const dist_context *ctx, int worker)
@@ -1940,6 +1951,67 @@ static void disti_activate(int activation, float scale, size_t n, float *y, floa
 }
 
 /*@ 04 field -------------------------------------------------------------------------------------------------------- */
+
+/* b = M a and b = M^T a, 3 x 3 row-major. */
+static void disti_rotate(const double m[9], const double a[3], double b[3])
+{
+    for (int i = 0; i < 3; i++) b[i] = m[3 * i] * a[0] + m[3 * i + 1] * a[1] + m[3 * i + 2] * a[2];
+}
+
+static void disti_rotate_back(const double m[9], const double a[3], double b[3])
+{
+    for (int i = 0; i < 3; i++) b[i] = m[i] * a[0] + m[3 + i] * a[1] + m[6 + i] * a[2];
+}
+
+static double disti_dot(const double a[3], const double b[3])
+{
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
+
+static void disti_cross(const double a[3], const double b[3], double c[3])
+{
+    c[0] = a[1] * b[2] - a[2] * b[1];
+    c[1] = a[2] * b[0] - a[0] * b[2];
+    c[2] = a[0] * b[1] - a[1] * b[0];
+}
+
+/* Scales to unit length; 0 and leaves it alone if that cannot be done. */
+static int disti_normalize(double a[3])
+{
+    double length = sqrt(disti_dot(a, a));
+    if (!(length > 1e-150)) return 0;
+    for (int i = 0; i < 3; i++) a[i] /= length;
+    return 1;
+}
+
+/* Rows of m to the nearest frame with the first two rows' plane kept (Gram and Schmidt, third by cross product). */
+static void disti_orthonormalize(double m[9])
+{
+    double along;
+    disti_normalize(m);
+    along = disti_dot(m, m + 3);
+    for (int i = 0; i < 3; i++) m[3 + i] -= along * m[i];
+    disti_normalize(m + 3);
+    disti_cross(m, m + 3, m + 6);
+}
+
+/* m <- exp([w]x) m by Rodrigues: exp([w]x) = I + a [w]x + b [w]x^2, a = sin|w| / |w|, b = (1 - cos|w|) / |w|^2;
+   kept orthonormal. */
+static void disti_turn(const float w[3], float m[9])
+{
+    double v[3] = {(double)w[0], (double)w[1], (double)w[2]}, r[9], s, c;
+    double angle = sqrt(disti_dot(v, v));
+    disti_sincos(angle, &s, &c);
+    double a = angle > 1e-8 ? s / angle : 1.0, b = angle > 1e-4 ? (1.0 - c) / (angle * angle) : 0.5;
+    double e[9] = {c + b * v[0] * v[0], b * v[0] * v[1] - a * v[2], b * v[0] * v[2] + a * v[1],
+                   b * v[0] * v[1] + a * v[2], c + b * v[1] * v[1], b * v[1] * v[2] - a * v[0],
+                   b * v[0] * v[2] - a * v[1], b * v[1] * v[2] + a * v[0], c + b * v[2] * v[2]};
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++)
+            r[3 * i + j] = e[3 * i] * (double)m[j] + e[3 * i + 1] * (double)m[3 + j] + e[3 * i + 2] * (double)m[6 + j];
+    disti_orthonormalize(r);
+    for (int i = 0; i < 9; i++) m[i] = (float)r[i];
+}
 
 /* Analytic fields: f, grad f and the adjoint for the numbers they are made of, in one function each; q = p - center.
    At the few points where |q| or the like is 0 the gradient is 0. */
@@ -3164,15 +3236,6 @@ typedef struct disti_block {
     int columns;
 } disti_block;
 
-static void *disti_take(unsigned char *base, size_t *at, size_t count, size_t size)
-{
-    size_t bytes = (count * size + DISTI_ALIGNMENT - 1) &
-                   ~(size_t)(DISTI_ALIGNMENT - 1); /* small factors: cannot overflow */
-    unsigned char *p = base ? base + *at : NULL;
-    *at += bytes;
-    return p;
-}
-
 /* Returns the bytes needed; base NULL: only that. Sizes are bounded by 32 layers of 8192 + 99 rows. */
 static size_t disti_block_layout(const dist_net *net, unsigned char *base, disti_block *b)
 {
@@ -3658,9 +3721,7 @@ static void disti_fold_sum(const dist_net *net, const disti_block *b, const floa
 /* dist_field.fused_fn of a net. The reverse pass runs from f's own slope (seed 1), so that it leaves grad f; delta
    is linear in the seed, so the seeds may come afterwards: d_code needs only sum_c seed[c] delta[.][c]. */
 static void disti_shape_fused(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient,
-                              void (*seed_fn)(void *seed_user, size_t first, size_t count, const float *sdf,
-                                              const float *gradient, float *d_sdf),
-                              void *seed_user, double *d_code)
+                              dist_seed_fn seed_fn, void *seed_user, double *d_code)
 {
     const dist_shape *shape = (const dist_shape *)user;
     const dist_net *net = shape->net;
@@ -4836,49 +4897,6 @@ DIST_API dist_status dist_net_set_code(dist_context *ctx, dist_net *net, int ind
 
 /*@ 06 camera ------------------------------------------------------------------------------------------------------- */
 
-/* b = M a and b = M^T a, 3 x 3 row-major. */
-static void disti_rotate(const double m[9], const double a[3], double b[3])
-{
-    for (int i = 0; i < 3; i++) b[i] = m[3 * i] * a[0] + m[3 * i + 1] * a[1] + m[3 * i + 2] * a[2];
-}
-
-static void disti_rotate_back(const double m[9], const double a[3], double b[3])
-{
-    for (int i = 0; i < 3; i++) b[i] = m[i] * a[0] + m[3 + i] * a[1] + m[6 + i] * a[2];
-}
-
-static double disti_dot(const double a[3], const double b[3])
-{
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-}
-
-static void disti_cross(const double a[3], const double b[3], double c[3])
-{
-    c[0] = a[1] * b[2] - a[2] * b[1];
-    c[1] = a[2] * b[0] - a[0] * b[2];
-    c[2] = a[0] * b[1] - a[1] * b[0];
-}
-
-/* Scales to unit length; 0 and leaves it alone if that cannot be done. */
-static int disti_normalize(double a[3])
-{
-    double length = sqrt(disti_dot(a, a));
-    if (!(length > 1e-150)) return 0;
-    for (int i = 0; i < 3; i++) a[i] /= length;
-    return 1;
-}
-
-/* Rows of m to the nearest frame with the first two rows' plane kept (Gram and Schmidt, third by cross product). */
-static void disti_orthonormalize(double m[9])
-{
-    double along;
-    disti_normalize(m);
-    along = disti_dot(m, m + 3);
-    for (int i = 0; i < 3; i++) m[3 + i] -= along * m[i];
-    disti_normalize(m + 3);
-    disti_cross(m, m + 3, m + 6);
-}
-
 /* What the tracer and the adjoint use of a camera, in double. */
 typedef struct disti_view {
     double rotation[9], translation[3], center[3]; /* center = -R^T t */
@@ -5054,25 +5072,10 @@ DIST_API void dist_camera_get_colmap(const dist_camera *camera, float quaternion
     memcpy(translation, camera->translation, sizeof camera->translation);
 }
 
-/* Rodrigues: exp([w]x) = I + a [w]x + b [w]x^2, a = sin|w| / |w|, b = (1 - cos|w|) / |w|^2. */
 DIST_API void dist_camera_move(dist_camera *camera, const float w[3], const float t[3])
 {
     if (!camera) return;
-    if (w) {
-        double v[3] = {(double)w[0], (double)w[1], (double)w[2]}, m[9], r[9], s, c;
-        double angle = sqrt(disti_dot(v, v));
-        disti_sincos(angle, &s, &c);
-        double a = angle > 1e-8 ? s / angle : 1.0, b = angle > 1e-4 ? (1.0 - c) / (angle * angle) : 0.5;
-        double e[9] = {c + b * v[0] * v[0], b * v[0] * v[1] - a * v[2], b * v[0] * v[2] + a * v[1],
-                       b * v[0] * v[1] + a * v[2], c + b * v[1] * v[1], b * v[1] * v[2] - a * v[0],
-                       b * v[0] * v[2] - a * v[1], b * v[1] * v[2] + a * v[0], c + b * v[2] * v[2]};
-        for (int i = 0; i < 9; i++) m[i] = (double)camera->rotation[i];
-        for (int i = 0; i < 3; i++)
-            for (int j = 0; j < 3; j++)
-                r[3 * i + j] = e[3 * i] * m[j] + e[3 * i + 1] * m[3 + j] + e[3 * i + 2] * m[6 + j];
-        disti_orthonormalize(r);
-        for (int i = 0; i < 9; i++) camera->rotation[i] = (float)r[i];
-    }
+    if (w) disti_turn(w, camera->rotation);
     for (int i = 0; t && i < 3; i++) camera->translation[i] += t[i];
 }
 

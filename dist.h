@@ -219,10 +219,6 @@ typedef struct dist_gradients {
     float *weights;     /* (field.weight_count), the order of dist_net_weights */
 } dist_gradients;
 
-   gradient is NULL where grads->weights is wanted. Called from several workers at once. */
-typedef void (*dist_seed_fn)(void *seed_user, size_t first, size_t count, const float *sdf, const float *gradient,
-                             float *d_sdf);
-
 /* Adjoint of dist_field_eval: with L = sum_i d_sdf[i] f(points[i]), adds dL/dcode and dL/dweights to grads and
    d_sdf[i] * grad f(points[i]) to d_points (n, 3) unless NULL.
    d_sdf (n): the weights, in; with seed_fn it is filled from it instead: then value and adjoint cost one pass together.

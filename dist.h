@@ -461,6 +461,33 @@ DIST_API float dist_loss_color(size_t n, const float *color, const float *target
 /* |code|^2; n: its length */
 DIST_API float dist_loss_code(size_t n, const float *code, float weight, float *d_code);
 
+/* A photo with what was rendered from its camera; planes of camera.width * camera.height. */
+typedef struct dist_photo {
+    const float *color;        /* (h, w, 3), 0 to 1; what is not finite does not count: a mask, if one is wanted */
+    const float *depth;        /* z in camera space, as dist_render gives it */
+    const unsigned char *mask; /* 1 where the depth is a hit; NULL: everywhere */
+    dist_camera camera;
+} dist_photo;
+
+typedef struct dist_photometric_desc {
+    float visibility;       /* largest squared difference of the two depths, world units; 0: 1e-3; negative: any */
+    float ssim;             /* share of structural similarity, 0 to 1 */
+    float *warped;          /* (h, w, 3) of `to`: gets what `from` shows of it, 0 where nothing; NULL: not wanted */
+    unsigned char *visible; /* (h, w) of `to`: gets 1 at the pixels that count; NULL: not wanted */
+} dist_photometric_desc;
+
+/* Photo `from` warped into view `to` through the depth of `to` and compared with what `to` saw:
+       p = unproject_to(x, depth), x' = project_from(p),
+       (1 - ssim) mean |I_to(x) - I_from(x')| + ssim mean (1 - SSIM)/2,      bilinear I_from; SSIM over 3 x 3 pixels
+   over the channels and the pixels that hit, lie in front of `from` and inside its picture, and are not hidden there:
+   (z of p in `from` - its depth at x')^2 < visibility; from->depth may be NULL: nothing is hidden. Windows of SSIM
+   count where all nine pixels do. Adds dL/ddepth of `to` to d_depth (h, w) and, each unless NULL, dL/d(rotation,
+   translation) of `to` and then of `from` to d_cameras (12), at this depth: what the depth itself does as the camera
+   moves is dist_render_backward's to add. What is visible is held constant.
+   desc may be NULL. A camera that dist_render refuses, or an ssim out of range: 0 and no gradient. */
+DIST_API float dist_loss_photometric(const dist_photo *to, const dist_photo *from, const dist_photometric_desc *desc,
+                                     float weight, float *d_depth, float d_cameras[12]);
+
 /* ---- 10 optimizer ------------------------------------------------------------------------------------------------ */
 
 #ifndef DIST_NO_BACKWARD
@@ -7223,6 +7250,239 @@ DIST_API float dist_loss_code(size_t n, const float *code, float weight, float *
         if (d_code) d_code[j] += (float)(2.0 * (double)weight * (double)code[j]);
     }
     return (float)((double)weight * sum);
+}
+
+/* Photometric loss. One pixel's way from view `to` into view `from`, with r its ray of depth 1:
+       c = depth r,   q = M c + b = R_from R_to^T (c - t_to) + t_from,
+       u = (fx q_x + skew q_y) / q_z + cx,   v = fy q_y / q_z + cy,   color = bilinear I_from(u, v) */
+typedef struct disti_warp {
+    double color[3], slope[3][2]; /* and its derivatives by u and v */
+    double ray[3], q[3];
+    int visible;
+} disti_warp;
+
+typedef struct disti_photo_pair {
+    const dist_photo *to, *from;
+    disti_view view_to, view_from;
+    double turn[9], shift[3]; /* M, b */
+    double visibility, ssim;
+} disti_photo_pair;
+
+/* Weights and pixels of the bilinear sample at (u, v); 0 outside the picture. */
+static int disti_bilinear(const disti_view *view, double u, double v, size_t pixel[4], double part[2])
+{
+    if (!(u >= 0.0 && v >= 0.0 && u <= view->width - 1.0 && v <= view->height - 1.0)) return 0;
+    size_t w = (size_t)view->width, x = (size_t)u, y = (size_t)v;
+    size_t right = x + 1 < w ? 1 : 0, below = y + 1 < (size_t)view->height ? w : 0;
+    part[0] = u - (double)x;
+    part[1] = v - (double)y;
+    pixel[0] = y * w + x;
+    pixel[1] = pixel[0] + right;
+    pixel[2] = pixel[0] + below;
+    pixel[3] = pixel[1] + below;
+    return 1;
+}
+
+static int disti_photo_depth_counts(const dist_photo *photo, size_t i)
+{
+    return disti_loss_hit(photo->mask, i) && disti_finite(photo->depth[i]) && photo->depth[i] > 0.0f &&
+           photo->depth[i] < 1e5f;
+}
+
+static void disti_warp_pixel(const disti_photo_pair *pair, int x, int y, disti_warp *warp)
+{
+    const disti_view *a = &pair->view_to, *b = &pair->view_from;
+    const dist_photo *from = pair->from;
+    size_t i = (size_t)y * (size_t)a->width + (size_t)x, pixel[4];
+    double part[2], *q = warp->q;
+    memset(warp, 0, sizeof *warp);
+    if (!disti_photo_depth_counts(pair->to, i) || !disti_finite_all(3, pair->to->color + 3 * i)) return;
+    warp->ray[1] = (y + a->first - a->cy) / a->fy;
+    warp->ray[0] = (x + a->first - a->cx - a->skew * warp->ray[1]) / a->fx;
+    warp->ray[2] = 1.0;
+    disti_rotate(pair->turn, warp->ray, q);
+    for (int k = 0; k < 3; k++) q[k] = q[k] * (double)pair->to->depth[i] + pair->shift[k];
+    if (!(q[2] > 1e-9)) return;
+    double u = (b->fx * q[0] + b->skew * q[1]) / q[2] + b->cx - b->first, v = b->fy * q[1] / q[2] + b->cy - b->first;
+    if (!disti_bilinear(b, u, v, pixel, part)) return;
+    double share[4] = {(1.0 - part[0]) * (1.0 - part[1]), part[0] * (1.0 - part[1]), (1.0 - part[0]) * part[1],
+                       part[0] * part[1]};
+    double depth = 0.0, sum = 0.0;
+    for (int c = 0; c < 4; c++) {
+        if (!disti_finite_all(3, from->color + 3 * pixel[c])) return;
+        if (!from->depth || share[c] == 0.0 || !disti_photo_depth_counts(from, pixel[c])) continue;
+        depth += share[c] * (double)from->depth[pixel[c]];
+        sum += share[c];
+    }
+    if (from->depth && pair->visibility >= 0.0) { /* the mean of the corners that are hits: an outline is seen, too */
+        double off = sum > 0.0 ? q[2] - depth / sum : 0.0;
+        if (!(sum > 0.0) || !(off * off < pair->visibility)) return;
+    }
+    for (size_t k = 0; k < 3; k++) {
+        double corner[4];
+        for (int c = 0; c < 4; c++) corner[c] = (double)from->color[3 * pixel[c] + k];
+        double top = corner[1] - corner[0], bottom = corner[3] - corner[2], left = corner[2] - corner[0];
+        warp->slope[k][0] = top + part[1] * (bottom - top);
+        warp->slope[k][1] = left + part[0] * (bottom - top);
+        warp->color[k] = corner[0] + part[0] * warp->slope[k][0] + part[1] * left;
+    }
+    warp->visible = 1;
+}
+
+/* forward   SSIM = A B / (C D) of the warped x and the seen y, m, s their means and (co)variances over nine pixels:
+             A = 2 m_x m_y + 1e-4, B = 2 s_xy + 9e-4, C = m_x^2 + m_y^2 + 1e-4, D = s_xx + s_yy + 9e-4
+   backward  d_x_k += d_SSIM 2/9 (m_y B / (C D) + A (y_k - m_y) / (C D) - SSIM (m_x / C + (x_k - m_x) / D)) */
+static double disti_ssim(const double x[9], const double y[9], double d_ssim, double d_x[9])
+{
+    double mx = 0.0, my = 0.0, sxx = 0.0, syy = 0.0, sxy = 0.0;
+    for (int k = 0; k < 9; k++) mx += x[k] / 9.0, my += y[k] / 9.0;
+    for (int k = 0; k < 9; k++) {
+        sxx += (x[k] - mx) * (x[k] - mx) / 9.0;
+        syy += (y[k] - my) * (y[k] - my) / 9.0;
+        sxy += (x[k] - mx) * (y[k] - my) / 9.0;
+    }
+    double a = 2.0 * mx * my + 1e-4, b = 2.0 * sxy + 9e-4, c = mx * mx + my * my + 1e-4, d = sxx + syy + 9e-4;
+    double ssim = a * b / (c * d);
+    for (int k = 0; k < 9; k++)
+        d_x[k] = d_ssim * 2.0 / 9.0 *
+                 (my * b / (c * d) + a * (y[k] - my) / (c * d) - ssim * (mx / c + (x[k] - mx) / d));
+    return ssim;
+}
+
+/* A square of pixels with the two rings around it that its 3 x 3 windows reach into. */
+enum { DISTI_WARP_TILE = 12, DISTI_WARP_SIDE = DISTI_WARP_TILE + 4 };
+typedef struct disti_warp_tile {
+    int left, top, width, height; /* of the square; warp[0] is the pixel (left - 2, top - 2) */
+    disti_warp warp[DISTI_WARP_SIDE * DISTI_WARP_SIDE];
+    double d_color[DISTI_WARP_SIDE * DISTI_WARP_SIDE][3];
+} disti_warp_tile;
+
+/* Windows around the square's pixels and, for the gradient, those around its ring; d_ssim: of each one's mean. */
+static void disti_warp_windows(const disti_photo_pair *pair, disti_warp_tile *tile, double d_ssim, double sum[2])
+{
+    const dist_photo *to = pair->to;
+    for (int row = 1; row <= tile->height + 2; row++) {
+        for (int column = 1; column <= tile->width + 2; column++) {
+            int first = (row - 1) * DISTI_WARP_SIDE + column - 1, all = 1;
+            int own = row >= 2 && row < tile->height + 2 && column >= 2 && column < tile->width + 2;
+            for (int k = 0; k < 9; k++) all &= tile->warp[first + k / 3 * DISTI_WARP_SIDE + k % 3].visible;
+            if (!all || (!own && d_ssim == 0.0)) continue;
+            for (size_t channel = 0; channel < 3; channel++) {
+                double x[9], y[9], d_x[9];
+                for (int k = 0; k < 9; k++) {
+                    size_t u = (size_t)(tile->left + column - 3 + k % 3), v = (size_t)(tile->top + row - 3 + k / 3);
+                    x[k] = tile->warp[first + k / 3 * DISTI_WARP_SIDE + k % 3].color[channel];
+                    y[k] = (double)to->color[3 * (v * (size_t)to->camera.width + u) + channel];
+                }
+                double ssim = disti_ssim(x, y, d_ssim, d_x);
+                for (int k = 0; k < 9; k++) tile->d_color[first + k / 3 * DISTI_WARP_SIDE + k % 3][channel] += d_x[k];
+                if (own) sum[0] += 0.5 - 0.5 * ssim;
+            }
+            if (own) sum[1] += 3.0;
+        }
+    }
+}
+
+/* backward  d_color = sum over its windows, + share sign(color - I_to);  g = d_color . dcolor/d(u, v);
+             d_q = (g_u fx, g_u skew + g_v fy, -(g_u (fx q_x + skew q_y) + g_v fy q_y) / q_z) / q_z
+             d_depth += d_q . M r
+             from: d_t += d_q, d_w += (q - t) x d_q;   to: with y = M^T d_q  d_t -= y, d_w += y x (c - t) */
+static void disti_warp_backward(const disti_photo_pair *pair, const disti_warp *warp, const double d_color[3],
+                                size_t i, float *d_depth, double d_cameras[12])
+{
+    const disti_view *b = &pair->view_from;
+    const double *q = warp->q;
+    double g[2] = {0.0, 0.0}, d_q[3], y[3], arm[3], torque[3];
+    for (int k = 0; k < 3; k++)
+        for (int axis = 0; axis < 2; axis++) g[axis] += d_color[k] * warp->slope[k][axis];
+    d_q[0] = g[0] * b->fx / q[2];
+    d_q[1] = (g[0] * b->skew + g[1] * b->fy) / q[2];
+    d_q[2] = -(d_q[0] * q[0] + d_q[1] * q[1]) / q[2];
+    disti_rotate_back(pair->turn, d_q, y);
+    if (d_depth) d_depth[i] += (float)disti_dot(y, warp->ray);
+    for (int k = 0; k < 3; k++)
+        arm[k] = warp->ray[k] * (double)pair->to->depth[i] - pair->view_to.translation[k];
+    disti_cross(y, arm, torque);
+    for (int k = 0; k < 3; k++) {
+        d_cameras[k] += torque[k];
+        d_cameras[3 + k] -= y[k];
+        arm[k] = q[k] - b->translation[k];
+        d_cameras[9 + k] += d_q[k];
+    }
+    disti_cross(arm, d_q, torque);
+    for (int k = 0; k < 3; k++) d_cameras[6 + k] += torque[k];
+}
+
+/* One sweep over the picture. Without scale: sums and counts of both terms (L1, its count, SSIM's, its count) and the
+   planes of desc; with it, weight / count of each, the gradient. */
+static void disti_warp_sweep(const disti_photo_pair *pair, const dist_photometric_desc *desc, const double *scale,
+                             double sum[4], float *d_depth, double d_cameras[12])
+{
+    disti_warp_tile tile;
+    int width = pair->view_to.width, height = pair->view_to.height, rim = pair->ssim > 0.0 ? 2 : 0;
+    for (tile.top = 0; tile.top < height; tile.top += DISTI_WARP_TILE) {
+        for (tile.left = 0; tile.left < width; tile.left += DISTI_WARP_TILE) {
+            tile.width = DISTI_MIN(DISTI_WARP_TILE, width - tile.left);
+            tile.height = DISTI_MIN(DISTI_WARP_TILE, height - tile.top);
+            memset(tile.d_color, 0, sizeof tile.d_color);
+            for (int k = 0; k < DISTI_WARP_SIDE * DISTI_WARP_SIDE; k++) {
+                int x = k % DISTI_WARP_SIDE - 2, y = k / DISTI_WARP_SIDE - 2;
+                tile.warp[k].visible = 0;
+                if (x < -rim || y < -rim || x >= tile.width + rim || y >= tile.height + rim) continue;
+                x += tile.left;
+                y += tile.top;
+                if (x >= 0 && y >= 0 && x < width && y < height) disti_warp_pixel(pair, x, y, &tile.warp[k]);
+            }
+            if (rim) disti_warp_windows(pair, &tile, scale ? -0.5 * scale[1] : 0.0, sum + 2);
+            for (int k = 0; k < tile.width * tile.height; k++) {
+                int x = k % tile.width, y = k / tile.width, place = (y + 2) * DISTI_WARP_SIDE + x + 2;
+                size_t i = (size_t)(tile.top + y) * (size_t)width + (size_t)(tile.left + x);
+                const disti_warp *warp = &tile.warp[place];
+                if (!scale && desc && desc->visible) desc->visible[i] = (unsigned char)warp->visible;
+                for (size_t c = 0; c < 3; c++) {
+                    double off = warp->visible ? warp->color[c] - (double)pair->to->color[3 * i + c] : 0.0;
+                    if (!scale && desc && desc->warped)
+                        desc->warped[3 * i + c] = warp->visible ? (float)warp->color[c] : 0.0f;
+                    sum[0] += fabs(off);
+                    sum[1] += warp->visible;
+                    if (scale) tile.d_color[place][c] += scale[0] * disti_sign(off);
+                }
+                if (scale && warp->visible)
+                    disti_warp_backward(pair, warp, tile.d_color[place], i, d_depth, d_cameras);
+            }
+        }
+    }
+}
+
+DIST_API float dist_loss_photometric(const dist_photo *to, const dist_photo *from, const dist_photometric_desc *desc,
+                                     float weight, float *d_depth, float d_cameras[12])
+{
+    disti_photo_pair pair;
+    double sum[4] = {0.0, 0.0, 0.0, 0.0}, again[4] = {0.0, 0.0, 0.0, 0.0}, scale[2], d_pose[12], turned[3];
+    float ssim = desc ? desc->ssim : 0.0f, visibility = desc ? desc->visibility : 0.0f;
+    if (!to || !from || !to->color || !to->depth || !from->color || !(ssim >= 0.0f && ssim <= 1.0f)) return 0.0f;
+    if (disti_camera_check(NULL, &to->camera, "") != DIST_OK || disti_camera_check(NULL, &from->camera, "") != DIST_OK)
+        return 0.0f;
+    pair.to = to;
+    pair.from = from;
+    pair.ssim = (double)ssim;
+    pair.visibility = visibility == 0.0f ? 1e-3 : (double)visibility;
+    disti_view_of(&to->camera, &pair.view_to);
+    disti_view_of(&from->camera, &pair.view_from);
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++)
+            pair.turn[3 * i + j] = disti_dot(pair.view_from.rotation + 3 * i, pair.view_to.rotation + 3 * j);
+    disti_rotate(pair.turn, pair.view_to.translation, turned);
+    for (int i = 0; i < 3; i++) pair.shift[i] = pair.view_from.translation[i] - turned[i];
+    disti_warp_sweep(&pair, desc, NULL, sum, NULL, NULL);
+    scale[0] = sum[1] > 0.0 ? (1.0 - pair.ssim) * (double)weight / sum[1] : 0.0;
+    scale[1] = sum[3] > 0.0 ? pair.ssim * (double)weight / sum[3] : 0.0;
+    if (d_depth || d_cameras) {
+        memset(d_pose, 0, sizeof d_pose);
+        disti_warp_sweep(&pair, NULL, scale, again, d_depth, d_pose);
+        for (int i = 0; d_cameras && i < 12; i++) d_cameras[i] += (float)d_pose[i];
+    }
+    return (float)(scale[0] * sum[0] + scale[1] * sum[2]);
 }
 
 /*@ 10 optimizer ---------------------------------------------------------------------------------------------------- */

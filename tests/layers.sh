@@ -64,4 +64,5 @@ knows_not() {
 }
 knows_not "07 08" '(disti?|DISTI?)_(net|shape|NET|SHAPE)' tracer_and_renderer_know_no_network
 knows_not 05 'disti?_(camera|tape|render|images|trace)' network_knows_no_camera
-knows_not "09 10" 'disti?_(context|field|net|shape|camera|render|trace|tape|run|alloc)' losses_and_optimizer_know_only_arrays
+knows_not "09 10" 'disti?_(context|field|net|shape|render|trace|tape|run|alloc)' losses_and_optimizer_know_only_arrays
+knows_not 10 'disti?_camera' optimizer_knows_no_camera

@@ -348,7 +348,8 @@ enum {
     DIST_RAY_UNRESOLVED, /* step budget spent: mask 0, distance of the sample of smallest |f| */
     DIST_RAY_INSIDE,     /* started inside the solid: as how.inside says */
     DIST_RAY_PLATEAU,    /* f is small and flat: no crossing within reach; mask 0 */
-    DIST_RAY_NOT_FINITE  /* the field gave NaN or infinity: mask 0 */
+    DIST_RAY_NOT_FINITE, /* the field gave NaN or infinity: mask 0 */
+    DIST_RAY_SKIPPED     /* not asked for (how.pixels): mask 0, silhouette 0, no query, no gradient */
 };
 
 typedef struct dist_render_desc {
@@ -369,6 +370,8 @@ typedef struct dist_render_desc {
     float lipschitz;     /* 0: the field's */
     int no_cones;        /* 1: every ray marches from the bounding sphere by itself */
     int no_prediction;   /* 1: no ray starts from what its neighbors found */
+    /* (height, width): only pixels that are not 0 are traced. Read during dist_render; NULL: all. dist_trace: NULL */
+    const unsigned char *pixels;
 } dist_render_desc;
 
 /* What will be used: every 0 replaced by its default. */
@@ -5803,6 +5806,7 @@ static int disti_ray_is_hit(const disti_tracer *tracer, const disti_ray *ray)
 
 static void disti_stats_ray(const disti_tracer *tracer, const disti_ray *ray, dist_stats *stats)
 {
+    if (ray->status == DIST_RAY_SKIPPED) return;
     stats->rays++;
     stats->rays_in_sphere += ray->enter < ray->leave;
     stats->hits += (unsigned)disti_ray_is_hit(tracer, ray);
@@ -5867,6 +5871,8 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
     if (status != DIST_OK) return status;
     if (n > 0 && (!origins || !directions || !hits))
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_trace: origins, directions or hits is NULL", NULL, 0, 0);
+    if (tracer.how.pixels)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_trace: how.pixels is for pictures, must be NULL", NULL, 0, 0);
     if (n > (size_t)1 << 40)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_trace: n is %d, at most 2^40", NULL, (double)n, 0);
     disti_stats_begin(ctx);
@@ -5891,6 +5897,7 @@ typedef struct disti_cone {
     int x, y;     /* first pixel, within the tile */
     int size;
     int blocked;
+    int rays;     /* not done yet */
     float f;      /* last sample */
 } disti_cone;
 
@@ -5898,9 +5905,16 @@ typedef struct disti_cone {
    pixel has neighbors on both sides to be predicted from. */
 typedef struct disti_tile {
     const disti_view *view;
+    const size_t *list; /* pixels of the rays, which then stand in one row; NULL: a rectangle */
     int x, y, width, height; /* traced: at most DISTI_TILE + 1 each */
     int own_width, own_height; /* written */
 } disti_tile;
+
+static size_t disti_tile_pixel(const disti_tile *tile, int i)
+{
+    if (tile->list) return tile->list[i];
+    return (size_t)(tile->y + i / tile->width) * (size_t)tile->view->width + (size_t)(tile->x + i % tile->width);
+}
 
 /* One past the last pixel of a block that starts at `first`: the extra column goes with the last block. */
 static int disti_block_end(int first, int size, int own, int traced)
@@ -5927,10 +5941,12 @@ static void disti_cone_init(const disti_tracer *tracer, const disti_tile *tile, 
     disti_ray_init(tracer->field, tile->view->center, world, 0.0, &cone->axis);
     cone->enter = 1e300;
     cone->leave = -1e300;
+    cone->rays = 0;
     for (int y = cone->y; y <= y1; y++) {
         for (int x = cone->x; x <= x1; x++) {
             const disti_ray *ray = &bench->rays[y * tile->width + x];
             if (ray->mode == DISTI_DONE) continue;
+            cone->rays++;
             cone->enter = DISTI_MIN(cone->enter, ray->base + (double)ray->enter);
             cone->leave = DISTI_MAX(cone->leave, ray->base + (double)ray->leave);
         }
@@ -5982,6 +5998,7 @@ static void disti_cone_finish(const disti_tracer *tracer, const disti_tile *tile
 enum {
     DISTI_CONE_FIRST = 32,
     DISTI_CONE_LEAF = 4,
+    DISTI_CONE_RAYS = 4, /* fewer march by themselves */
     DISTI_CONES_MOST = (DISTI_TILE / DISTI_CONE_LEAF) * (DISTI_TILE / DISTI_CONE_LEAF)
 };
 
@@ -5991,8 +6008,9 @@ static void disti_cone_rounds(const disti_tracer *tracer, int worker, const dist
 {
     size_t active = 0;
     for (int i = 0; i < count; i++) {
-        cones[i].blocked = 0;
-        if (cones[i].enter <= cones[i].leave && cones[i].t < cones[i].leave) bench->index[active++] = i;
+        cones[i].blocked = cones[i].rays < DISTI_CONE_RAYS;
+        if (cones[i].blocked) cones[i].f = 3e38f; /* no sample */
+        else if (cones[i].enter <= cones[i].leave && cones[i].t < cones[i].leave) bench->index[active++] = i;
     }
     for (int round = 0; active > 0; round++) {
         size_t kept = 0;
@@ -6571,6 +6589,8 @@ static void disti_pixel_ray(const disti_view *view, const dist_field *field, int
     ray->cosine = (float)local[2];
 }
 
+enum { DISTI_LIST_TASKS = 256, DISTI_LIST_RAYS = 4096 };
+
 typedef struct disti_render_job {
     const disti_tracer *tracer;
     const disti_view *view;
@@ -6578,6 +6598,7 @@ typedef struct disti_render_job {
     dist_tape *tape;
     int tile, across;
     int predict; /* pixels start from what their neighbors found */
+    size_t first[DISTI_LIST_TASKS + 1]; /* disti_render_list: first pixel of each task */
 } disti_render_job;
 
 /* Gradients of f at up to DISTI_GRADIENTS hit points at a time. */
@@ -6632,8 +6653,7 @@ static void disti_render_normals(const disti_render_job *job, int worker, const 
             if (!disti_normalize(g)) continue;
             if (tracer->how.normal_space == DIST_SPACE_WORLD) memcpy(normal, g, sizeof normal);
             else disti_rotate(tile->view->rotation, g, normal);
-            size_t pixel = (size_t)(tile->y + bench->index[k] / tile->width) * (size_t)tile->view->width +
-                           (size_t)(tile->x + bench->index[k] % tile->width);
+            size_t pixel = disti_tile_pixel(tile, bench->index[k]);
             for (size_t axis = 0; axis < 3; axis++) job->out->normal[3 * pixel + axis] = (float)normal[axis];
         }
     }
@@ -6656,8 +6676,7 @@ static void disti_render_colors(const disti_render_job *job, int worker, const d
         field->color_fn(field->user, worker, count, points, color);
         bench->stats->queries += count;
         for (size_t k = 0; k < count; k++) {
-            size_t pixel = (size_t)(tile->y + bench->index[k] / tile->width) * (size_t)tile->view->width +
-                           (size_t)(tile->x + bench->index[k] % tile->width);
+            size_t pixel = disti_tile_pixel(tile, bench->index[k]);
             memcpy(job->out->color + 3 * pixel, color + 3 * k, 3 * sizeof(float));
         }
     }
@@ -6682,33 +6701,46 @@ static float disti_ray_silhouette(const disti_tracer *tracer, const disti_ray *r
     return DISTI_MAX(magnitude - epsilon, tiny);
 }
 
-static void disti_render_planes(const disti_render_job *job, const disti_tile *tile, const disti_bench *bench)
+/* All planes of one pixel but its normal and color, which hits get later. */
+static void disti_render_pixel(const disti_render_job *job, const disti_ray *ray, size_t pixel)
 {
     const disti_tracer *tracer = job->tracer;
     const dist_images *out = job->out;
-    for (int i = 0; i < tile->width * tile->height; i++) {
-        const disti_ray *ray = &bench->rays[i];
-        int x = tile->x + i % tile->width, y = tile->y + i / tile->width, hit = disti_ray_is_hit(tracer, ray);
-        size_t pixel = (size_t)y * (size_t)tile->view->width + (size_t)x;
-        double distance = ray->base + (double)ray->best, local[3];
-        disti_stats_ray(tracer, ray, bench->stats);
-        if (out->depth) {
-            disti_view_direction(tile->view, x, y, local);
-            out->depth[pixel] = hit ? (float)(distance * local[2]) : tracer->how.background;
-        }
-        if (out->distance) out->distance[pixel] = hit ? (float)distance : tracer->how.background;
-        if (out->silhouette) out->silhouette[pixel] = disti_ray_silhouette(tracer, ray);
-        if (out->mask) out->mask[pixel] = (unsigned char)hit;
-        if (out->status) out->status[pixel] = ray->status;
-        if (out->error) out->error[pixel] = hit ? ray->error : 0.0f;
-        if (out->normal) out->normal[3 * pixel] = out->normal[3 * pixel + 1] = out->normal[3 * pixel + 2] = 0.0f;
-        if (out->color) memcpy(out->color + 3 * pixel, tracer->how.background_color, 3 * sizeof(float));
-        if (!job->tape) continue;
-        int sampled = ray->enter < ray->leave && ray->fbest < 2e38f && ray->status != DIST_RAY_NOT_FINITE;
-        job->tape->s[pixel] = ray->best;
-        job->tape->status[pixel] = (unsigned char)(ray->status | (ray->status == DIST_RAY_HIT ? DISTI_TAPE_HIT : 0) |
-                                                   (sampled ? DISTI_TAPE_SAMPLE : 0));
+    int hit = disti_ray_is_hit(tracer, ray), skipped = ray->status == DIST_RAY_SKIPPED;
+    double distance = ray->base + (double)ray->best, local[3];
+    if (out->depth) {
+        if (hit) disti_view_direction(job->view, (int)(pixel % (size_t)job->view->width),
+                                      (int)(pixel / (size_t)job->view->width), local);
+        out->depth[pixel] = hit ? (float)(distance * local[2]) : tracer->how.background;
     }
+    if (out->distance) out->distance[pixel] = hit ? (float)distance : tracer->how.background;
+    if (out->silhouette) out->silhouette[pixel] = skipped ? 0.0f : disti_ray_silhouette(tracer, ray);
+    if (out->mask) out->mask[pixel] = (unsigned char)hit;
+    if (out->status) out->status[pixel] = ray->status;
+    if (out->error) out->error[pixel] = hit ? ray->error : 0.0f;
+    if (out->normal) out->normal[3 * pixel] = out->normal[3 * pixel + 1] = out->normal[3 * pixel + 2] = 0.0f;
+    if (out->color) memcpy(out->color + 3 * pixel, tracer->how.background_color, 3 * sizeof(float));
+    if (!job->tape) return;
+    int sampled = ray->enter < ray->leave && ray->fbest < 2e38f && ray->status != DIST_RAY_NOT_FINITE;
+    job->tape->s[pixel] = ray->best;
+    job->tape->status[pixel] = (unsigned char)(ray->status | (ray->status == DIST_RAY_HIT ? DISTI_TAPE_HIT : 0) |
+                                               (sampled ? DISTI_TAPE_SAMPLE : 0));
+}
+
+static void disti_render_planes(const disti_render_job *job, const disti_tile *tile, const disti_bench *bench)
+{
+    for (int i = 0; i < tile->width * tile->height; i++) {
+        disti_stats_ray(job->tracer, &bench->rays[i], bench->stats);
+        disti_render_pixel(job, &bench->rays[i], disti_tile_pixel(tile, i));
+    }
+}
+
+/* A pixel that nobody asked for. */
+static void disti_ray_skip(disti_ray *ray)
+{
+    memset(ray, 0, sizeof *ray);
+    ray->fbest = 3e38f;
+    ray->status = DIST_RAY_SKIPPED; /* mode is DISTI_DONE, and the sphere is not met: enter = leave */
 }
 
 /* Drops the extra column and row: what follows is about the tile's own pixels. */
@@ -6725,11 +6757,13 @@ static void disti_render_task(void *arg, int index, int worker)
 {
     const disti_render_job *job = (const disti_render_job *)arg;
     const disti_tracer *tracer = job->tracer;
+    const unsigned char *pixels = tracer->how.pixels;
     disti_bench bench;
     disti_tile tile;
     double local[3];
     disti_bench_init(tracer->ctx, worker, &bench);
     tile.view = job->view;
+    tile.list = NULL;
     tile.x = index % job->across * job->tile;
     tile.y = index / job->across * job->tile;
     tile.own_width = tile.width = DISTI_MIN(job->tile, job->view->width - tile.x);
@@ -6738,9 +6772,12 @@ static void disti_render_task(void *arg, int index, int worker)
     if (predict && tile.x + tile.width < job->view->width) tile.width++;
     if (predict && tile.y + tile.height < job->view->height) tile.height++;
     int n = tile.width * tile.height;
-    for (int i = 0; i < n; i++)
-        disti_pixel_ray(job->view, tracer->field, tile.x + i % tile.width, tile.y + i / tile.width, local,
-                        &bench.rays[i]);
+    for (int i = 0; i < n; i++) {
+        if (pixels && !pixels[disti_tile_pixel(&tile, i)]) disti_ray_skip(&bench.rays[i]);
+        else
+            disti_pixel_ray(job->view, tracer->field, tile.x + i % tile.width, tile.y + i / tile.width, local,
+                            &bench.rays[i]);
+    }
 #ifndef DIST_NO_PAPER
     if (tracer->how.trace == DIST_TRACE_PAPER) {
         size_t first = (size_t)tile.y * (size_t)job->view->width + (size_t)tile.x;
@@ -6759,6 +6796,61 @@ static void disti_render_task(void *arg, int index, int worker)
     disti_render_planes(job, &tile, &bench);
     if (job->out->normal) disti_render_normals(job, worker, &tile, &bench);
     if (job->out->color) disti_render_colors(job, worker, &tile, &bench);
+}
+
+/* Pixels that stand alone have no neighbors to share cones and predictions with: their rays, and no others, are packed
+   together from all over the picture. 0: most stand close together (more than one in eight has its right neighbor
+   asked for, too), or tiles are needed for the silhouette. The count of tasks follows from the picture alone. */
+static int disti_render_list(const disti_tracer *tracer, const disti_view *view, disti_render_job *job)
+{
+    const unsigned char *pixels = tracer->how.pixels;
+    size_t n = (size_t)view->width * (size_t)view->height, wanted = 0, pairs = 0;
+    if (!pixels || job->out->silhouette || tracer->how.trace != DIST_TRACE_GUARDED) return 0;
+    for (size_t i = 0; i < n; i++) {
+        wanted += pixels[i] != 0;
+        pairs += pixels[i] && i + 1 < n && pixels[i + 1];
+    }
+    if (8 * pairs > wanted) return 0;
+    size_t each = DISTI_MAX(wanted / DISTI_LIST_TASKS + 1, (size_t)DISTI_LIST_RAYS / 16);
+    int count = 1;
+    job->first[0] = 0;
+    for (size_t i = 0, seen = 0; i < n; i++) {
+        if (!pixels[i]) continue;
+        if (seen == (size_t)count * each) job->first[count++] = i;
+        seen++;
+    }
+    job->first[count] = n;
+    return count;
+}
+
+static void disti_render_list_task(void *arg, int index, int worker)
+{
+    const disti_render_job *job = (const disti_render_job *)arg;
+    const disti_tracer *tracer = job->tracer;
+    disti_bench bench;
+    disti_tile tile;
+    disti_ray skipped;
+    double local[3];
+    disti_bench_init(tracer->ctx, worker, &bench);
+    disti_ray_skip(&skipped);
+    memset(&tile, 0, sizeof tile);
+    size_t *list = (size_t *)(void *)(bench.rest + DISTI_REST_BYTES - DISTI_LIST_RAYS * sizeof(size_t));
+    tile.view = job->view;
+    tile.list = list;
+    tile.height = 1;
+    for (size_t i = job->first[index]; i < job->first[index + 1];) {
+        for (tile.width = 0; i < job->first[index + 1] && tile.width < DISTI_LIST_RAYS; i++) {
+            disti_render_pixel(job, &skipped, i);
+            if (!tracer->how.pixels[i]) continue;
+            list[tile.width] = i;
+            disti_pixel_ray(job->view, tracer->field, (int)(i % (size_t)job->view->width),
+                            (int)(i / (size_t)job->view->width), local, &bench.rays[tile.width++]);
+        }
+        disti_trace_all(tracer, worker, &bench, (size_t)tile.width);
+        disti_render_planes(job, &tile, &bench);
+        if (job->out->normal) disti_render_normals(job, worker, &tile, &bench);
+        if (job->out->color) disti_render_colors(job, worker, &tile, &bench);
+    }
 }
 
 /* Neighbors say something about each other where pixels are near each other: a hundredth of the radius. */
@@ -6803,7 +6895,9 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
                                                                                                         : DISTI_TILE;
     job.across = (view.width + job.tile - 1) / job.tile;
     job.predict = disti_render_predicts(&tracer, &view);
-    disti_run(ctx, job.across * ((view.height + job.tile - 1) / job.tile), disti_render_task, &job);
+    int listed = disti_render_list(&tracer, &view, &job);
+    int count = listed ? listed : job.across * ((view.height + job.tile - 1) / job.tile);
+    disti_run(ctx, count, listed ? disti_render_list_task : disti_render_task, &job);
     disti_stats_end(ctx, &tracer, out->stats);
     if (!tape) return DIST_OK;
     tape->rendered = 1;
@@ -6812,6 +6906,7 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     tape->camera = *camera;
     tape->tracer = tracer;
     tape->tracer.field = &tape->field;
+    tape->tracer.how.pixels = NULL;
     return DIST_OK;
 }
 
@@ -7038,6 +7133,10 @@ static void disti_backward_pixels(disti_render_backward_job *job)
         for (int x = 0; x < tape->width; x++) {
             size_t pixel = (size_t)y * (size_t)tape->width + (size_t)x;
             int hit = tape->status[pixel] & DISTI_TAPE_HIT;
+            if (tape->status[pixel] == DIST_RAY_SKIPPED) {
+                job->skipped++;
+                continue;
+            }
             float d_depth = hit ? disti_upstream(d_out->depth, pixel) : 0.0f;
             float d_distance = hit ? disti_upstream(d_out->distance, pixel) : 0.0f;
             float d_silhouette = disti_upstream(d_out->silhouette, pixel);

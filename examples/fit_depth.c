@@ -28,6 +28,8 @@ typedef struct fit {
     size_t code_size;
     float *code, *d_code;
     dist_images out, d_out;
+    dist_render_desc how;  /* with the observed pixels alone where no silhouette is compared */
+    unsigned char *pixels; /* those that are observed */
     dist_stats stats;
 } fit;
 
@@ -49,10 +51,16 @@ static fit fit_create(dist_context *ctx, const dist_net *net, const fit_options 
     f.out.depth = take_floats(seen->n);
     f.d_out.depth = take_floats(seen->n);
     f.out.mask = (unsigned char *)take(seen->n, 1);
-    if (!o->no_mask) {
+    f.how = o->how;
+    f.pixels = (unsigned char *)take(seen->n, 1);
+    for (size_t i = 0; i < seen->n; i++) {
+        f.pixels[i] = seen->seen[i] > 0.0f;
+    }
+    if (!o->no_mask && o->weights[1] > 0.0f) {
         f.out.silhouette = take_floats(seen->n);
         f.d_out.silhouette = take_floats(seen->n);
     }
+    if (!f.out.silhouette) { f.how.pixels = f.pixels; }
     check(ctx);
     return f;
 }
@@ -65,6 +73,7 @@ static void fit_destroy(fit *f)
     free(f->out.depth);
     free(f->d_out.depth);
     free(f->out.mask);
+    free(f->pixels);
     free(f->out.silhouette);
     free(f->d_out.silhouette);
 }
@@ -83,7 +92,7 @@ static double fit_loss(fit *f, double terms[3])
     f->d_out.stats = &f->stats;
 
     dist_shape_set_code(f->shape, f->code);
-    dist_render(f->ctx, &f->field, &f->camera, &f->options->how, &f->out, f->tape);
+    dist_render(f->ctx, &f->field, &f->camera, &f->how, &f->out, f->tape);
     check(f->ctx);
     terms[0] = (double)dist_loss_depth(s->n, f->out.depth, s->seen, f->out.mask, weights[0], f->d_out.depth);
     terms[1] = 0;
@@ -127,8 +136,11 @@ static double fit_run(fit *f, double *loss, float *path, dist_stats *total)
 /* Loss and picture scores of one code; with target points also Chamfer. *mesh gets the surface if asked for. */
 static score fit_score(fit *f, const float *code, const float *target_points, double terms[3], dist_mesh **mesh)
 {
+    const unsigned char *pixels = f->how.pixels;
     memcpy(f->code, code, f->code_size * sizeof(float));
+    f->how.pixels = NULL; /* scores are about the whole picture */
     double loss = fit_loss(f, terms);
+    f->how.pixels = pixels;
     score result = score_pictures(f->seen, f->out.depth, f->out.mask);
     result.loss = loss;
     float *points = NULL;

@@ -901,6 +901,152 @@ TEST(dead_fields_are_all_miss_all_inside_or_plateau)
     dist_context_destroy(ctx);
 }
 
+/* ---- only what is looked at -------------------------------------------------------------------------------------- */
+
+static void check_not_asked(const planes *p, int i, const dist_render_desc *how)
+{
+    CHECK_EQUAL(DIST_RAY_SKIPPED, p->status[i]);
+    CHECK_EQUAL(0, p->mask[i]);
+    CHECK_NEAR((double)how->background, (double)p->depth[i], 0.0);
+    CHECK_NEAR(0.0, (double)p->silhouette[i], 0.0);
+    CHECK_NEAR(0.0, (double)p->normal[3 * i], 0.0);
+}
+
+TEST(twenty_points_cost_no_more_than_their_twenty_rays)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(SIDE, SIDE);
+    for (int k = 0; k < 3; k++) {
+        test_shape shape = some_shape(k);
+        dist_field field = shape_field(&shape, 1, 1);
+        static unsigned char pixels[SIDE * SIDE];
+        dist_render_desc how = plain_how();
+        unsigned long long alone = 0;
+        how.background = 3;
+        how.no_cones = 1;
+        dist_images out = all_planes(&a);
+        out.color = NULL;
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+        how.no_cones = 0;
+        memset(pixels, 0, sizeof pixels);
+        out = all_planes(&b);
+        out.color = NULL;
+        out.normal = out.silhouette = NULL;
+        for (int i = 0; i < 20; i++) { /* each alone */
+            memset(pixels, 0, sizeof pixels);
+            pixels[(i * 997 + 41 * k + SIDE * 20) % (SIDE * SIDE)] = 1;
+            how.pixels = pixels;
+            CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+            CHECK_EQUAL(1, b.stats.rays);
+            alone += b.stats.queries;
+        }
+        for (int i = 0; i < 20; i++) pixels[(i * 997 + 41 * k + SIDE * 20) % (SIDE * SIDE)] = (unsigned char)(i + 1);
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+        CHECK_EQUAL(20, b.stats.rays);
+        CHECK_EQUAL(alone, b.stats.queries);
+        CHECK_EQUAL(0, b.stats.cone_queries + b.stats.normal_queries + b.stats.silhouette_queries);
+        memset(b.normal, 0, sizeof b.normal);
+        memset(b.silhouette, 0, sizeof b.silhouette);
+        for (int i = 0; i < SIDE * SIDE; i++) {
+            if (!pixels[i]) check_not_asked(&b, i, &how);
+            else CHECK_BYTES(sizeof(float), &a.depth[i], &b.depth[i]);
+        }
+        out = all_planes(&b); /* with the silhouette there are tiles, but still no other ray */
+        out.color = NULL;
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+        CHECK_EQUAL(20, b.stats.rays);
+        CHECK_EQUAL(0, b.stats.cone_queries);
+        CHECK(b.stats.silhouette_queries <= 20 * 16);
+        CHECK(b.stats.normal_queries == b.stats.hits && b.stats.hits > 0 && b.stats.hits < 20);
+        CHECK(b.stats.queries - b.stats.silhouette_queries - b.stats.normal_queries <= alone);
+        for (int i = 0; i < SIDE * SIDE; i++) {
+            if (!pixels[i]) check_not_asked(&b, i, &how);
+            else CHECK(a.mask[i] == b.mask[i] && (a.silhouette[i] < 0) == (b.silhouette[i] < 0));
+        }
+    }
+    dist_context_destroy(ctx);
+}
+
+TEST(a_window_of_pixels_is_what_the_whole_picture_shows_there)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(SIDE, SIDE);
+    for (int k = 0; k < 6; k++) {
+        test_shape shape = some_shape(k % 3);
+        dist_field field = shape_field(&shape, 1, 1);
+        static unsigned char pixels[SIDE * SIDE];
+        dist_render_desc how = plain_how();
+        how.trace = k < 3 ? DIST_TRACE_GUARDED : DIST_TRACE_PAPER;
+        dist_images out = all_planes(&a);
+        out.color = NULL;
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+        for (int i = 0; i < SIDE * SIDE; i++) {
+            int x = i % SIDE, y = i / SIDE;
+            pixels[i] = x >= 30 && x < 57 && y >= 20 && y < 70;
+        }
+        how.pixels = pixels;
+        out = all_planes(&b);
+        out.color = NULL;
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+        CHECK_EQUAL(27 * 50, b.stats.rays);
+        CHECK(b.stats.queries < a.stats.queries * 3 / 4);
+        for (int i = 0; i < SIDE * SIDE; i++) {
+            if (!pixels[i]) {
+                check_not_asked(&b, i, &how);
+                continue;
+            }
+            CHECK_EQUAL(a.mask[i], b.mask[i]);
+            CHECK_NEAR((double)a.distance[i], (double)b.distance[i], k < 3 ? 4e-4 : 4e-3);
+        }
+        memset(pixels, 0, sizeof pixels);
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+        CHECK_EQUAL(0, b.stats.queries + b.stats.rays);
+    }
+    dist_context_destroy(ctx);
+}
+
+#ifndef DIST_NO_BACKWARD
+TEST(pixels_not_asked_for_give_no_gradient)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(SIDE, SIDE);
+    const float torus[5] = {0, 0, 0, 0.6f, 0.2f};
+    dist_field field = dist_field_torus(torus);
+    static unsigned char pixels[SIDE * SIDE];
+    static float ones[SIDE * SIDE], picked[SIDE * SIDE];
+    float code[2][5] = {{0}}, turn[2][3] = {{0}};
+    for (int k = 0; k < 2; k++) { /* all pixels traced, some looked at; only those traced, all looked at */
+        dist_render_desc how = plain_how();
+        dist_gradients grads;
+        dist_images d_out;
+        memset(&grads, 0, sizeof grads);
+        memset(&d_out, 0, sizeof d_out);
+        dist_tape *tape = dist_tape_create(ctx, &camera, &how);
+        for (int i = 0; i < SIDE * SIDE; i++) {
+            ones[i] = 1;
+            pixels[i] = i % 7 == 3;
+            picked[i] = pixels[i];
+        }
+        how.pixels = k ? pixels : NULL;
+        dist_images out = all_planes(&a);
+        out.color = NULL;
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, tape), ctx);
+        d_out.depth = d_out.silhouette = k ? ones : picked;
+        d_out.stats = &a.stats;
+        grads.code = code[k];
+        grads.rotation = turn[k];
+        CHECK_STATUS(DIST_OK, dist_render_backward(ctx, tape, &d_out, &grads), ctx);
+        CHECK(a.stats.skipped >= SIDE * SIDE * 6 / 7 && a.stats.skipped < SIDE * SIDE);
+        dist_tape_destroy(tape);
+    }
+    /* the hits differ within their error bounds, and grazing rays divide by little */
+    for (int j = 0; j < 5; j++) CHECK_NEAR((double)code[0][j], (double)code[1][j], 5.0);
+    for (int j = 0; j < 3; j++) CHECK_NEAR((double)turn[0][j], (double)turn[1][j], 5.0);
+    CHECK(fabs((double)code[0][4]) > 100.0);
+    dist_context_destroy(ctx);
+}
+#endif
+
 int main(int argc, char **argv)
 {
     test_begin(argc, argv);
@@ -928,5 +1074,10 @@ int main(int argc, char **argv)
     RUN(inside_modes_are_what_the_desc_says);
     RUN(nan_from_the_field_spoils_only_its_pixels);
     RUN(dead_fields_are_all_miss_all_inside_or_plateau);
+    RUN(twenty_points_cost_no_more_than_their_twenty_rays);
+    RUN(a_window_of_pixels_is_what_the_whole_picture_shows_there);
+#ifndef DIST_NO_BACKWARD
+    RUN(pixels_not_asked_for_give_no_gradient);
+#endif
     return test_report();
 }

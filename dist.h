@@ -211,18 +211,21 @@ DIST_API dist_status dist_field_eval(dist_context *ctx, const dist_field *field,
 
 #ifndef DIST_NO_BACKWARD
 /* Where gradients go; NULL is not wanted and costs nothing. All are added to.
-   rotation: tangent w of R' = exp([w]x) R; translation: of x_cam = R x + t. */
+   rotation: tangent w of R' = exp([w]x) R; translation: of x_cam = R x + t; focal and principal: of the camera's
+   numbers in pixels, to be stepped by adding to them. */
 typedef struct dist_gradients {
     float *code;        /* (field.code_size) */
     float *rotation;    /* (3) */
     float *translation; /* (3) */
     float *weights;     /* (field.weight_count), the order of dist_net_weights */
+    float *focal;       /* (2): dL/dfx, dL/dfy */
+    float *principal;   /* (2): dL/dcx, dL/dcy */
 } dist_gradients;
 
 /* Adjoint of dist_field_eval: with L = sum_i d_sdf[i] f(points[i]), adds dL/dcode and dL/dweights to grads and
    d_sdf[i] * grad f(points[i]) to d_points (n, 3) unless NULL.
    d_sdf (n): the weights, in; with seed_fn it is filled from it instead: then value and adjoint cost one pass together.
-   grads->rotation and ->translation must be NULL. */
+   The camera's members of grads must be NULL. */
 DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *field, size_t n, const float *points,
                                          float *d_sdf, dist_seed_fn seed_fn, void *seed_user, float *d_points,
                                          const dist_gradients *grads);
@@ -539,7 +542,7 @@ DIST_API dist_mesh *dist_mesh_create(dist_context *ctx, size_t vertex_count, con
 DIST_API void dist_mesh_destroy(dist_mesh *mesh);
 #ifndef DIST_NO_BACKWARD
 /* Adjoint of extraction: a vertex moves by dv = -n df / |grad f|, so d_vertices (vertex_count, 3) reaches the
-   field's code and weights. grads->rotation and ->translation must be NULL. */
+   field's code and weights. The camera's members of grads must be NULL. */
 DIST_API dist_status dist_mesh_backward(dist_context *ctx, const dist_field *field, const dist_mesh *mesh,
                                         const float *d_vertices, const dist_gradients *grads);
 #endif
@@ -2365,6 +2368,12 @@ static dist_status disti_gradients_check(dist_context *ctx, const dist_field *fi
     return DIST_OK;
 }
 
+/* 1 if a camera's gradient is wanted. */
+static int disti_gradients_camera(const dist_gradients *grads)
+{
+    return grads->rotation || grads->translation || grads->focal || grads->principal;
+}
+
 DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *field, size_t n, const float *points,
                                          float *d_sdf, dist_seed_fn seed_fn, void *seed_user, float *d_points,
                                          const dist_gradients *grads)
@@ -2378,9 +2387,10 @@ DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *fi
     if (!d_sdf && (!seed_fn || grads->weights))
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: d_sdf is NULL, needed without seed_fn and for weights", name, 0,
                           0);
-    if (grads->rotation || grads->translation)
+    if (disti_gradients_camera(grads))
         return disti_fail(ctx, DIST_BAD_ARGUMENT,
-                          "%s: grads.rotation and grads.translation must be NULL: no camera here", name, 0, 0);
+                          "%s: grads.rotation, translation, focal and principal must be NULL: no camera here", name, 0,
+                          0);
     size_t size = (size_t)field->code_size;
     /* one more slot than the pieces use: the total */
     status = disti_partial_reserve(ctx, size + size / DISTI_SLOTS + 1);
@@ -6483,8 +6493,10 @@ enum { DISTI_CHUNK = DISTI_SLOTS * 4 * DISTI_BLOCK }; /* points of the backward 
 typedef struct disti_entry {
     float d_distance;   /* dL/d(distance along the ray), field units */
     float d_sdf;        /* dL/df at this point from elsewhere: silhouette, normal's differences, the paper's samples */
+    float d_depth;      /* dL/d(depth), which the ray's tilt alone changes too */
     float direction[3]; /* of the ray, field space */
     float pivot[3];     /* the point that turns with the camera: the hit, also for a normal's differences around it */
+    float weight;       /* of the implicit rule: |n . v| in the normal mode, 1 else */
     unsigned char capped;
 } disti_entry;
 
@@ -6682,16 +6694,29 @@ static void disti_render_colors(const disti_render_job *job, int worker, const d
     }
 }
 
+/* Point of a ray off the bounding sphere that is nearest to it: the closest approach or, where that lies behind the
+   camera, the camera. Returns its distance from the sphere's center; away: the unit vector from there. */
+static double disti_ray_nearest(const dist_field *field, const disti_ray *ray, double point[3], double away[3])
+{
+    for (int i = 0; i < 3; i++) {
+        point[i] = (double)ray->origin[i] - DISTI_MIN(ray->base, 0.0) * (double)ray->direction[i];
+        away[i] = point[i] - (double)field->center[i];
+    }
+    double distance = sqrt(disti_dot(away, away));
+    disti_normalize(away);
+    return distance;
+}
+
 /* Value of the soft silhouette of a finished ray: signed f at a hit, |f| at a miss, less epsilon; off the sphere the
-   line's distance to it. The sign says hit or miss whatever rounding did. */
+   ray's distance to it. The sign says hit or miss whatever rounding did. */
 static float disti_ray_silhouette(const disti_tracer *tracer, const disti_ray *ray)
 {
     const dist_field *field = tracer->field;
     float tiny = 1e-3f * tracer->noise;
     if (ray->enter >= ray->leave) {
-        float d = disti_length(ray->origin[0] - field->center[0], ray->origin[1] - field->center[1],
-                               ray->origin[2] - field->center[2]);
-        return DISTI_MAX(d - field->radius, tiny);
+        double nearest[3], away[3];
+        float off = (float)(disti_ray_nearest(field, ray, nearest, away) - (double)field->radius);
+        return DISTI_MAX(off, tiny);
     }
     float f = ray->fbest, magnitude = f < 0.0f ? -f : f;
     float epsilon = disti_ray_epsilon(tracer, ray, ray->best);
@@ -6922,26 +6947,26 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
               |f| > 0.1: the seed alpha d_t at each p_k. The residual e of eq. (4) is dropped, and K samples are
               summed, not averaged: the paper's approximation, in the scale of its authors' code.      (paper, 3.4)
    silhouette S = f(p_min) - epsilon: the seed d_S at the sample of smallest |f|                    (envelope theorem)
-              off the sphere S = |o| - radius with o the closest approach: y = d_S o / |o|.
+              off the sphere S = |o| - radius with o the ray's point nearest to it: y = d_S o / |o|.
    normal's   n = G / |G|: u = (d_n - n (n . d_n)) / |G| pulls on G. Of the field: u . dG, by differences of df:
               analytic (df(p + h u^) - df(p - h u^)) |u| / (2 h), which is first-order exact where f is smooth and the
               only derivative that a ReLU net has; difference mode sum_i u_i (df(p + h e_i) - df(p - h e_i)) / (2 h);
               and, but in the paper's mode, of the hit's motion: y += H u, d_t += v . H u, from grad f at the same
               points.
 
-   All of them end as seeds a on df and pulls y; for the camera, with q = R p and Y = R y: d_rotation -= q x Y,
-   d_translation -= Y; and a normal in camera space turns with it: d_rotation += n x d_n.                      */
+   All of them end as seeds a on df and pulls y, which disti_add_pull brings to the camera; and a normal in camera space
+   turns with it: d_rotation += n x d_n.                                                                       */
 typedef struct disti_render_backward_job {
     const dist_tape *tape;
     const dist_images *d_out;
     const dist_gradients *grads;
     dist_context *ctx;
     disti_view view;
-    double rotation[3], translation[3];
+    double rotation[3], translation[3], focal[2], principal[2];
     double *d_code;
     unsigned long long capped, points, skipped;
     size_t count;
-    int pose;
+    int camera; /* its gradient is wanted */
 } disti_render_backward_job;
 
 /* Seeds once grad f is known: d_sdf = entry's own, and the implicit rule's. */
@@ -6956,29 +6981,51 @@ static void disti_render_seed(void *user, size_t first, size_t count, const floa
         const float *g = gradient + 3 * i, *v = entry->direction;
         d_sdf[i] = entry->d_sdf;
         entry->capped = 0;
+        entry->weight = 1.0f;
         if (entry->d_distance == 0.0f) continue;
         float length = disti_length(g[0], g[1], g[2]);
-        if (!disti_finite(length) || !(length > 1e-30f)) continue;
+        if (!disti_finite(length) || !(length > 1e-30f)) {
+            entry->weight = 0.0f;
+            continue;
+        }
         float along = (g[0] * v[0] + g[1] * v[1] + g[2] * v[2]) / length; /* n . v, in [-1, 1] */
         float magnitude = along < 0.0f ? -along : along;
         float least = tape->tracer.how.gradient_cap;
         entry->capped = magnitude < least;
-        float weight = mode == DIST_GRADIENT_NORMAL ? magnitude : 1.0f;
+        if (mode == DIST_GRADIENT_NORMAL) entry->weight = magnitude;
         float bounded = DISTI_MAX(magnitude, least);
         /* at along = 0 the sign is that of a ray that enters */
-        d_sdf[i] += (along > 0.0f ? -1.0f : 1.0f) * entry->d_distance * weight / (bounded * length);
+        d_sdf[i] += (along > 0.0f ? -1.0f : 1.0f) * entry->d_distance * entry->weight / (bounded * length);
     }
 }
 
-static void disti_add_pull(disti_render_backward_job *job, const double p[3], const double y[3])
+/* The one place where a pixel's share reaches the camera. p: a point on a ray, where it is for this camera; y = dL/dp as
+   the camera moves and p keeps its distance t along its ray; d_z: dL/d(z of p in camera space) from elsewhere (depth
+   is t times the unit ray's z), which then only the ray's own tilt changes. In camera space, with Y = R y:
+
+   pose        p = R^T (q - translation), q = t l held still: d_rotation -= R p x Y, d_translation -= Y.
+   intrinsics  q = t l, l = n / |n|, n = (a, b, 1), b = (v - cy) / fy, a = (u - cx - skew b) / fx, so that
+               dq = Z (I - l l^T) dn with Z = t l_z, and e = (I - l l^T) (Y + d_z e_z) pulls on n with weight Z:
+               da = -(a dfx + dcx + skew db) / fx, db = -(b dfy + dcy) / fy; Z a and Z b are q's x and y. */
+static void disti_add_pull(disti_render_backward_job *job, const double p[3], const double y[3], double d_z)
 {
-    double q[3], turned[3], torque[3];
-    disti_rotate(job->view.rotation, p, q);
-    disti_rotate(job->view.rotation, y, turned);
-    disti_cross(q, turned, torque);
+    const disti_view *view = &job->view;
+    double q[3], pull[3], torque[3], e[2];
+    disti_rotate(view->rotation, p, q);
+    disti_rotate(view->rotation, y, pull);
+    disti_cross(q, pull, torque);
     for (int i = 0; i < 3; i++) {
         job->rotation[i] -= torque[i];
-        job->translation[i] -= turned[i];
+        job->translation[i] -= pull[i];
+        q[i] += view->translation[i];
+    }
+    pull[2] += d_z;
+    double square = disti_dot(q, q), along = square > 0.0 ? disti_dot(q, pull) / square : 0.0;
+    e[0] = (pull[0] - q[0] * along) / view->fx;
+    e[1] = (pull[1] - q[1] * along - view->skew * e[0]) / view->fy;
+    for (int i = 0; i < 2; i++) {
+        job->focal[i] -= e[i] * q[i];
+        job->principal[i] -= e[i] * q[2];
     }
 }
 
@@ -7000,25 +7047,27 @@ static void disti_backward_flush(disti_render_backward_job *job)
         field->weights_fn(field->user, job->ctx, job->count, tape->points, tape->d_sdf, NULL, NULL, NULL, NULL,
                           job->grads->weights);
     for (size_t i = 0; i < job->count; i++) {
-        job->capped += tape->entry[i].capped;
-        if (!job->pose) continue;
+        const disti_entry *entry = &tape->entry[i];
+        job->capped += entry->capped;
+        if (!job->camera) continue;
         double p[3], y[3];
         for (size_t k = 0; k < 3; k++) {
-            p[k] = (double)tape->entry[i].pivot[k];
+            p[k] = (double)entry->pivot[k];
             y[k] = (double)tape->d_points[3 * i + k];
         }
-        disti_add_pull(job, p, y);
+        disti_add_pull(job, p, y, (double)(entry->weight * entry->d_depth));
     }
     job->points += job->count;
     job->count = 0;
 }
 
 static void disti_backward_add(disti_render_backward_job *job, const disti_ray *ray, const float *point,
-                               const float *pivot, float d_distance, float d_sdf)
+                               const float *pivot, float d_distance, float d_depth, float d_sdf)
 {
     const dist_tape *tape = job->tape;
     disti_entry *entry = &tape->entry[job->count];
     entry->d_distance = d_distance;
+    entry->d_depth = d_depth;
     entry->d_sdf = d_sdf;
     memcpy(entry->direction, ray->direction, sizeof entry->direction);
     memcpy(entry->pivot, pivot, sizeof entry->pivot);
@@ -7068,55 +7117,57 @@ static float disti_backward_normal(disti_render_backward_job *job, const disti_r
         for (size_t k = 0; k < count; k++)
             for (size_t i = 0; i < 3; i++) motion += seeds[k] * slopes[3 * k + i] * ray->direction[i];
     }
-    for (size_t k = 0; k < count; k++) disti_backward_add(job, ray, points + 3 * k, p, 0.0f, seeds[k]);
+    for (size_t k = 0; k < count; k++) disti_backward_add(job, ray, points + 3 * k, p, 0.0f, 0.0f, seeds[k]);
     return disti_finite(motion) ? motion : 0.0f;
 }
 
 /* One pixel with an upstream gradient. */
-static void disti_backward_pixel(disti_render_backward_job *job, size_t pixel, float d_distance, float d_silhouette,
-                                 const float *d_normal)
+static void disti_backward_pixel(disti_render_backward_job *job, size_t pixel, float d_depth, float d_distance,
+                                 float d_silhouette, const float *d_normal)
 {
     const dist_tape *tape = job->tape;
     const dist_field *field = &tape->field;
     const disti_tracer *tracer = &tape->tracer;
     unsigned char status = tape->status[pixel];
     disti_ray ray;
-    double local[3];
+    double local[3], nearest[3], pull[3];
     float p[3];
     int x = (int)(pixel % (size_t)tape->width), y = (int)(pixel / (size_t)tape->width);
+    int paper = tracer->how.gradient == DIST_GRADIENT_PAPER;
     disti_pixel_ray(&job->view, field, x, y, local, &ray);
     if (ray.enter >= ray.leave) { /* off the sphere: only the camera feels it */
-        double o[3], pull[3], away[3];
-        for (int i = 0; i < 3; i++) {
-            o[i] = (double)ray.origin[i];
-            away[i] = o[i] - (double)field->center[i];
-        }
-        if (!disti_normalize(away)) return;
-        for (int i = 0; i < 3; i++) pull[i] = (double)d_silhouette * away[i];
-        disti_add_pull(job, o, pull);
+        disti_ray_nearest(field, &ray, nearest, pull);
+        for (int i = 0; i < 3; i++) pull[i] *= (double)d_silhouette;
+        disti_add_pull(job, nearest, pull, 0.0);
         return;
     }
     disti_ray_point(&ray, tape->s[pixel], p);
-    if (!(status & DISTI_TAPE_HIT)) d_distance = 0.0f;
     if (!(status & DISTI_TAPE_SAMPLE)) d_silhouette = 0.0f;
+    d_distance += d_depth * (float)local[2];
+    if (paper) { /* the tilt's share, which in the other modes goes with the hit's entry */
+        for (int i = 0; i < 3; i++) nearest[i] = (double)p[i], pull[i] = 0.0;
+        disti_add_pull(job, nearest, pull, (double)d_depth);
+        d_depth = 0.0f;
+    }
     if (d_normal && (status & DISTI_TAPE_HIT)) d_distance += disti_backward_normal(job, &ray, p, d_normal);
     if (tape->sample) {
         const float *samples = tape->sample + pixel * (size_t)tape->samples * 4;
-        int paper = tracer->how.gradient == DIST_GRADIENT_PAPER;
         for (int k = 0; k < (paper ? tape->samples : 1); k++) {
             float f = samples[4 * k], seed = k == 0 ? d_silhouette : 0.0f;
             int inside_clamp = (f < 0.0f ? -f : f) <= 0.1f * field->radius;
             if (paper && inside_clamp) seed += disti_paper_alpha(&tracer->how) * d_distance;
-            if (seed != 0.0f) disti_backward_add(job, &ray, samples + 4 * k + 1, samples + 4 * k + 1, 0.0f, seed);
+            if (seed != 0.0f)
+                disti_backward_add(job, &ray, samples + 4 * k + 1, samples + 4 * k + 1, 0.0f, 0.0f, seed);
         }
-        if (!paper && d_distance != 0.0f) disti_backward_add(job, &ray, p, p, d_distance, 0.0f);
+        if (!paper && d_distance != 0.0f) disti_backward_add(job, &ray, p, p, d_distance, d_depth, 0.0f);
         return;
     }
-    if (tracer->how.gradient == DIST_GRADIENT_PAPER) { /* all K samples are the hit */
+    if (paper) { /* all K samples are the hit */
         d_silhouette += tracer->how.step_scale * (float)tracer->how.samples * d_distance;
         d_distance = 0.0f;
     }
-    if (d_distance != 0.0f || d_silhouette != 0.0f) disti_backward_add(job, &ray, p, p, d_distance, d_silhouette);
+    if (d_distance != 0.0f || d_silhouette != 0.0f)
+        disti_backward_add(job, &ray, p, p, d_distance, d_depth, d_silhouette);
 }
 
 /* Upstream gradients that are not finite count as 0. */
@@ -7144,16 +7195,11 @@ static void disti_backward_pixels(disti_render_backward_job *job)
             for (size_t k = 0; hit && d_out->normal && k < 3; k++)
                 d_normal[k] = disti_upstream(d_out->normal, 3 * pixel + k);
             int normal = d_normal[0] != 0.0f || d_normal[1] != 0.0f || d_normal[2] != 0.0f;
-            if (d_depth != 0.0f) {
-                double local[3];
-                disti_view_direction(&job->view, x, y, local);
-                d_distance += d_depth * (float)local[2];
-            }
-            if (d_distance == 0.0f && d_silhouette == 0.0f && !normal) {
+            if (d_depth == 0.0f && d_distance == 0.0f && d_silhouette == 0.0f && !normal) {
                 job->skipped++;
                 continue;
             }
-            disti_backward_pixel(job, pixel, d_distance, d_silhouette, normal ? d_normal : NULL);
+            disti_backward_pixel(job, pixel, d_depth, d_distance, d_silhouette, normal ? d_normal : NULL);
         }
     }
     disti_backward_flush(job);
@@ -7188,19 +7234,21 @@ DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *ta
     job.d_out = d_out;
     job.grads = grads;
     job.ctx = ctx;
-    job.pose = grads->rotation != NULL || grads->translation != NULL;
+    job.camera = disti_gradients_camera(grads);
     disti_view_of(&tape->camera, &job.view);
     if (grads->code) {
         job.d_code = ctx->partial + (size_t)DISTI_SLOTS * size;
         memset(job.d_code, 0, size * sizeof(double));
     }
     unsigned state = disti_float_state_enter(); /* the normals' share is evaluated outside disti_run */
-    if (grads->code || grads->weights || job.pose) disti_backward_pixels(&job);
+    if (grads->code || grads->weights || job.camera) disti_backward_pixels(&job);
     disti_float_state_leave(state);
     for (size_t j = 0; grads->code && j < size; j++) grads->code[j] += (float)job.d_code[j];
     for (int i = 0; i < 3; i++) {
         if (grads->rotation) grads->rotation[i] += (float)job.rotation[i];
         if (grads->translation) grads->translation[i] += (float)job.translation[i];
+        if (grads->focal && i < 2) grads->focal[i] += (float)job.focal[i];
+        if (grads->principal && i < 2) grads->principal[i] += (float)job.principal[i];
     }
     if (d_out->stats) {
         d_out->stats->capped += job.capped;

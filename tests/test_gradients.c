@@ -7,16 +7,17 @@
 /* ---- a scene in double: a field, its numbers, and a camera ------------------------------------------------------- */
 
 enum { SPHERE, TORUS, BOX, NET };
-enum { CODE, ROTATION, TRANSLATION, WEIGHTS, GROUPS };
+enum { CODE, ROTATION, TRANSLATION, FOCAL, PRINCIPAL, WEIGHTS, GROUPS };
 enum { SIZE = 20, PIXELS = SIZE * SIZE };
 
-static const char *const group_names[GROUPS] = {"code", "rotation", "translation", "weights"};
+static const char *const group_names[GROUPS] = {"code", "rotation", "translation", "focal", "principal", "weights"};
 
 typedef struct scene {
     const char *name;
     int kind;
     model m;
-    double code[MODEL_CODE], w[3], translation[3]; /* rotation = exp([w]x) camera.rotation */
+    double code[MODEL_CODE], translation[3], focal[2], principal[2];
+    double w[3], rotation[9]; /* the pose is exp([w]x) rotation */
     int code_size;
     dist_camera camera;
     float codef[MODEL_CODE];
@@ -87,7 +88,7 @@ static void to_world(const scene *s, const double a[3], double b[3])
     turn(minus, a, c);
     for (int i = 0; i < 3; i++) {
         b[i] = 0.0;
-        for (int k = 0; k < 3; k++) b[i] += (double)s->camera.rotation[3 * k + i] * c[k];
+        for (int k = 0; k < 3; k++) b[i] += s->rotation[3 * k + i] * c[k];
     }
 }
 
@@ -96,7 +97,7 @@ static void to_camera(const scene *s, const double a[3], double b[3])
     double c[3];
     for (int i = 0; i < 3; i++) {
         c[i] = 0.0;
-        for (int k = 0; k < 3; k++) c[i] += (double)s->camera.rotation[3 * i + k] * a[k];
+        for (int k = 0; k < 3; k++) c[i] += s->rotation[3 * i + k] * a[k];
     }
     turn(s->w, c, b);
 }
@@ -109,8 +110,8 @@ static line line_of(const scene *s, int pixel)
 {
     line r;
     int width = s->camera.width;
-    double d[3] = {(pixel % width - (double)s->camera.cx) / (double)s->camera.fx,
-                   (pixel / width - (double)s->camera.cy) / (double)s->camera.fy, 1.0};
+    double d[3] = {0.0, (pixel / width - s->principal[1]) / s->focal[1], 1.0};
+    d[0] = (pixel % width - s->principal[0] - (double)s->camera.skew * d[1]) / s->focal[0];
     double length = sqrt(d[0] * d[0] + d[1] * d[1] + 1.0), minus[3];
     for (int i = 0; i < 3; i++) {
         d[i] /= length;
@@ -170,7 +171,7 @@ static double root_near(const scene *s, const line *r, double guess)
     return high;
 }
 
-/* Chord of the bounding sphere (center 0); 0 without one. */
+/* Chord of the bounding sphere (center 0); 0 without one in front of the camera. */
 static int chord(const scene *s, const line *r, double *enter, double *leave)
 {
     double b = 0.0, c = -(double)s->field.radius * (double)s->field.radius;
@@ -178,7 +179,7 @@ static int chord(const scene *s, const line *r, double *enter, double *leave)
         b += r->origin[i] * r->direction[i];
         c += r->origin[i] * r->origin[i];
     }
-    if (b * b <= c) return 0;
+    if (b * b <= c || -b + sqrt(b * b - c) < 0.0) return 0;
     *enter = -b - sqrt(b * b - c);
     *leave = -b + sqrt(b * b - c);
     return 1;
@@ -281,11 +282,25 @@ static dist_context *scene_context(void)
     return dist_context_create(&desc);
 }
 
+/* The camera's numbers in double; its rotation is taken orthonormal, as the library does. */
+static void scene_numbers(scene *s)
+{
+    for (int i = 0; i < 9; i++) s->rotation[i] = (double)s->camera.rotation[i];
+    disti_orthonormalize(s->rotation);
+    for (int i = 0; i < 3; i++) s->translation[i] = (double)s->camera.translation[i];
+    s->focal[0] = (double)s->camera.fx;
+    s->focal[1] = (double)s->camera.fy;
+    s->principal[0] = (double)s->camera.cx;
+    s->principal[1] = (double)s->camera.cy;
+}
+
 static void scene_look(scene *s)
 {
     float eye[3] = {1.2f, 0.9f, 1.8f}, at[3] = {0.03f, -0.02f, 0.01f}, up[3] = {0.1f, 1.0f, 0.0f};
     s->camera = dist_camera_look_at(SIZE, SIZE, 0.9f, eye, at, up);
-    for (int i = 0; i < 3; i++) s->translation[i] = (double)s->camera.translation[i];
+    s->camera.fy *= 1.1f;
+    s->camera.skew = 2.0f;
+    scene_numbers(s);
     for (int i = 0; i < s->code_size; i++) s->codef[i] = (float)s->code[i];
 }
 
@@ -342,17 +357,19 @@ static double *slot(scene *s, int group, int index)
     if (group == CODE) return &s->code[index];
     if (group == ROTATION) return &s->w[index];
     if (group == TRANSLATION) return &s->translation[index];
+    if (group == FOCAL) return &s->focal[index];
+    if (group == PRINCIPAL) return &s->principal[index];
     return &s->m.params[index];
 }
 
 static int slots(const scene *s, int group)
 {
     if (group == CODE) return s->code_size;
-    return group == WEIGHTS ? (int)s->m.count : 3;
+    return group == WEIGHTS ? (int)s->m.count : group == FOCAL || group == PRINCIPAL ? 2 : 3;
 }
 
 typedef struct result {
-    float code[MODEL_CODE], rotation[3], translation[3], *weights;
+    float code[MODEL_CODE], rotation[3], translation[3], focal[2], principal[2], *weights;
     dist_gradients grads;
 } result;
 
@@ -363,7 +380,14 @@ static void result_begin(result *r, const scene *s)
     r->grads.code = s->code_size ? r->code : NULL;
     r->grads.rotation = r->rotation;
     r->grads.translation = r->translation;
+    r->grads.focal = r->focal;
+    r->grads.principal = r->principal;
     r->grads.weights = s->kind == NET ? r->weights : NULL;
+}
+
+static void no_camera(dist_gradients *grads)
+{
+    grads->rotation = grads->translation = grads->focal = grads->principal = NULL;
 }
 
 static const float *result_group(const result *r, int group)
@@ -371,6 +395,8 @@ static const float *result_group(const result *r, int group)
     return group == CODE          ? r->code
            : group == ROTATION    ? r->rotation
            : group == TRANSLATION ? r->translation
+           : group == FOCAL       ? r->focal
+           : group == PRINCIPAL   ? r->principal
                                   : r->weights;
 }
 
@@ -491,7 +517,7 @@ static void field_check(scene *s)
         job.d_sdf[i] = (double)d_sdf[i];
     }
     result_begin(&got, s);
-    got.grads.rotation = got.grads.translation = NULL;
+    no_camera(&got.grads);
     CHECK_STATUS(DIST_OK,
                  dist_field_backward(s->ctx, &s->field, POINTS, points, d_sdf, NULL, NULL, d_points, &got.grads),
                  s->ctx);
@@ -631,6 +657,7 @@ static int pixel_value(const scene *s, const image_job *job, int i, double value
             squared += r.origin[k] * r.origin[k];
             along += r.origin[k] * r.direction[k];
         }
+        along = fmin(along, 0.0); /* the camera itself is nearest to what lies behind it */
         value[0] = sqrt(squared - along * along) - (double)s->field.radius;
         return 1;
     }
@@ -715,6 +742,94 @@ static int pixel_use(const scene *s, image_job *job, const pictures *a, const di
     return off < 1e-3;
 }
 
+/* What points on rays give to the camera, in double: rotation, translation, focal, principal. */
+typedef struct share {
+    double sum[4][3];
+} share;
+
+/* The intrinsics' part, of a pull y in camera space on a point q there that keeps its distance: by differences of the
+   ray through the place in the picture where q is seen. */
+static void share_lens(scene *s, const double q[3], const double y[3], share *to)
+{
+    double t = sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2]), skew = (double)s->camera.skew, h = 1e-4;
+    double u = (s->focal[0] * q[0] + skew * q[1]) / q[2] + s->principal[0];
+    double v = s->focal[1] * q[1] / q[2] + s->principal[1];
+    for (int group = FOCAL; group <= PRINCIPAL; group++)
+        for (int i = 0; i < 2; i++) {
+            double *x = slot(s, group, i), old = *x;
+            for (int side = -1; side <= 1; side += 2) {
+                *x = old + side * h;
+                double b = (v - s->principal[1]) / s->focal[1], a = (u - s->principal[0] - skew * b) / s->focal[0];
+                to->sum[group - ROTATION][i] +=
+                    side * t * (y[0] * a + y[1] * b + y[2]) / sqrt(a * a + b * b + 1.0) / (2.0 * h);
+            }
+            *x = old;
+        }
+}
+
+/* A pull y on a point p, both in the world, that is held still in camera space or on its ray: p = R^T (q - t). */
+static void share_pull(scene *s, const double p[3], const double y[3], share *to)
+{
+    double q[3], pull[3];
+    to_camera(s, p, q);
+    to_camera(s, y, pull);
+    for (int k = 0; k < 3; k++) {
+        to->sum[0][k] -= q[(k + 1) % 3] * pull[(k + 2) % 3] - q[(k + 2) % 3] * pull[(k + 1) % 3];
+        to->sum[1][k] -= pull[k];
+    }
+    for (int k = 0; k < 3; k++) q[k] += s->translation[k];
+    share_lens(s, q, pull, to);
+}
+
+/* The share of an upstream gradient of depth that the ray's tilt alone has: z of a point at a fixed distance. */
+static void share_tilt(scene *s, int pixel, double distance, double d_depth, share *to)
+{
+    line ray = line_of(s, pixel);
+    double q[3], y[3] = {0.0, 0.0, d_depth};
+    to_camera(s, ray.direction, q);
+    for (int k = 0; k < 3; k++) q[k] *= distance;
+    share_lens(s, q, y, to);
+}
+
+/* The camera's gradient by the implicit rule and the silhouette's, at the double's own hits: what differences of the
+   loss must be but for their own error. */
+static void check_rule(scene *s, const image_job *job)
+{
+    share rule;
+    double size = 0.0, error = 0.0;
+    const double h = 1e-6;
+    memset(&rule, 0, sizeof rule);
+    for (int i = 0; i < PIXELS; i++) {
+        double w = job->weight[i], p[3], g[3], pull = w, along = 0.0;
+        line r = line_of(s, i);
+        if (!(fabs(w) > 0.0)) continue;
+        line_point(&r, job->t[i], p);
+        field_gradient(s, p, 1e-5, g);
+        for (int k = 0; k < 3; k++) along += g[k] * r.direction[k];
+        if (job->plane == DEPTH) share_tilt(s, i, job->t[i], w, &rule);
+        if (job->plane == DEPTH || job->plane == DISTANCE) pull *= -(job->plane == DEPTH ? r.z : 1.0) / along;
+        for (int k = 0; k < 3; k++) g[k] *= pull;
+        share_pull(s, p, g, &rule);
+    }
+    for (int group = ROTATION; group <= PRINCIPAL; group++) {
+        for (int i = 0; i < slots(s, group); i++) {
+            double *x = slot(s, group, i), old = *x;
+            *x = old + h;
+            double expected = image_loss(s, job);
+            *x = old - h;
+            expected = (expected - image_loss(s, job)) / (2.0 * h);
+            *x = old;
+            error = fmax(error, fabs(expected - rule.sum[group - ROTATION][i]));
+            size = fmax(size, fabs(expected));
+        }
+        if (group == ROTATION) size = fmax(size, pull_size(s, image_loss, job));
+        MODEL_CHECK(error <= 1e-6 * size, s->name, "the rule in double", 1e-6, error / size);
+        if (test_state.verbose)
+            printf("    %s, %s in double: %.1e of %.2g\n", s->name, group_names[group], error / size, size);
+        if (group == TRANSLATION) size = error = 0.0; /* pixels, not lengths */
+    }
+}
+
 static void image_check(scene *s, int plane, const dist_render_desc *how, double tolerance)
 {
     static pictures a;
@@ -765,6 +880,7 @@ static void image_check(scene *s, int plane, const dist_render_desc *how, double
     if (test_state.verbose)
         printf("    %s of %s: %d pixels, %d excluded\n", plane_names[plane], s->name, used, excluded);
     for (int group = 0; group < GROUPS; group++) compare_group(s, group, &got, image_loss, &job, tolerance);
+    if (plane == DEPTH || plane == DISTANCE || plane == SILHOUETTE_SAMPLE) check_rule(s, &job);
     free(got.weights);
     dist_tape_destroy(tape);
 }
@@ -833,6 +949,24 @@ TEST(silhouette_backward_off_the_sphere_moves_only_the_camera)
     image_check_nets(SILHOUETTE_OFF, NULL, 1, 1e-3);
 }
 
+/* A wide lens that looks past the sphere: of most rays the camera itself is the point nearest to it. */
+TEST(silhouette_backward_with_the_sphere_behind_the_camera_matches_differences)
+{
+    scene s;
+    float eye[3] = {1.2f, 0.9f, 1.8f}, at[3] = {2.5f, 0.0f, 2.0f}, up[3] = {0, 1, 0};
+    scene_analytic(&s, SPHERE);
+    s.camera = dist_camera_look_at(SIZE, SIZE, 1.6f, eye, at, up);
+    scene_numbers(&s);
+    int behind = 0;
+    for (int i = 0; i < PIXELS; i++) {
+        line r = line_of(&s, i);
+        behind += r.origin[0] * r.direction[0] + r.origin[1] * r.direction[1] + r.origin[2] * r.direction[2] > 0.0;
+    }
+    CHECK(behind > PIXELS / 4 && behind < 3 * PIXELS / 4);
+    image_check(&s, SILHOUETTE_OFF, NULL, 1e-5);
+    scene_close(&s);
+}
+
 TEST(analytic_normal_backward_in_camera_space_matches_differences)
 {
     dist_render_desc how = normal_how(DIST_NORMAL_ANALYTIC, DIST_SPACE_CAMERA);
@@ -863,34 +997,36 @@ TEST(difference_normal_backward_in_world_space_matches_differences)
 
 /* ---- modes ------------------------------------------------------------------------------------------------------- */
 
-/* What seeds at points give to everybody, by dist_field_backward and, for the camera, the rule for a point that is held
-   still in camera space: p = R^T (q - t). */
+static void result_add(result *r, const share *from)
+{
+    for (int k = 0; k < 3; k++) {
+        r->rotation[k] += (float)from->sum[0][k];
+        r->translation[k] += (float)from->sum[1][k];
+        if (k < 2) r->focal[k] += (float)from->sum[2][k];
+        if (k < 2) r->principal[k] += (float)from->sum[3][k];
+    }
+}
+
+/* What seeds at points give to everybody, by dist_field_backward and, for the camera, share_pull. */
 static void adjoint_at(scene *s, size_t n, const float *points, float *seeds, result *r)
 {
     float *d_points = (float *)calloc(3 * n + 1, sizeof(float));
     dist_gradients grads = r->grads;
-    double rotation[3] = {0, 0, 0}, translation[3] = {0, 0, 0};
+    share camera;
     if (!d_points) exit(1);
-    grads.rotation = grads.translation = NULL;
+    memset(&camera, 0, sizeof camera);
+    no_camera(&grads);
     CHECK_STATUS(DIST_OK, dist_field_backward(s->ctx, &s->field, n, points, seeds, NULL, NULL, d_points, &grads),
                  s->ctx);
     for (size_t i = 0; i < n; i++) {
-        double p[3], y[3], q[3], pull[3];
-        for (int k = 0; k < 3; k++) {
-            p[k] = (double)points[3 * i + (size_t)k];
-            y[k] = (double)d_points[3 * i + (size_t)k];
+        double p[3], y[3];
+        for (size_t k = 0; k < 3; k++) {
+            p[k] = (double)points[3 * i + k];
+            y[k] = (double)d_points[3 * i + k];
         }
-        to_camera(s, p, q);
-        to_camera(s, y, pull);
-        for (int k = 0; k < 3; k++) {
-            rotation[k] -= q[(k + 1) % 3] * pull[(k + 2) % 3] - q[(k + 2) % 3] * pull[(k + 1) % 3];
-            translation[k] -= pull[k];
-        }
+        share_pull(s, p, y, &camera);
     }
-    for (int k = 0; k < 3; k++) {
-        r->rotation[k] += (float)rotation[k];
-        r->translation[k] += (float)translation[k];
-    }
+    result_add(r, &camera);
     free(d_points);
 }
 
@@ -907,6 +1043,14 @@ static void compare_results(const scene *s, const result *expected, const result
         MODEL_CHECK(error <= tolerance * size, s->name, group_names[group], tolerance, error / size);
         if (test_state.verbose) printf("    %s, %s: %.1e of %.2g\n", s->name, group_names[group], error / size, size);
     }
+}
+
+static void tilt_at(scene *s, int pixel, double distance, double d_depth, result *r)
+{
+    share tilt;
+    memset(&tilt, 0, sizeof tilt);
+    share_tilt(s, pixel, distance, d_depth, &tilt);
+    result_add(r, &tilt);
 }
 
 /* Three scenes: the torus, a ReLU net, a smooth one. */
@@ -1020,6 +1164,7 @@ TEST(paper_mode_after_the_guarded_tracer_is_alpha_k_df_at_the_hit)
             line_point(&r, (double)a.distance[i], p);
             for (int j = 0; j < 3; j++) points[3 * n + (size_t)j] = (float)p[j];
             seeds[n++] = (float)(1.25 * 3.0 * r.z * (double)w[i]);
+            tilt_at(&s, i, (double)a.distance[i], (double)w[i], &expected);
         }
         adjoint_at(&s, n, points, seeds, &expected);
         compare_results(&s, &expected, &got, 5e-4);
@@ -1066,6 +1211,7 @@ TEST(paper_mode_after_the_papers_tracer_is_alpha_df_summed_over_the_samples)
             line r = line_of(&s, i);
             double enter, leave;
             if (!chord(&s, &r, &enter, &leave)) continue;
+            if (a.mask[i]) tilt_at(&s, i, (double)a.distance[i], (double)w[i], &expected);
             for (int j = 0; j < how.samples; j++) {
                 const float *sample = tape->sample + (i * how.samples + j) * 4;
                 float seed = j == 0 ? ws[i] : 0.0f;
@@ -1116,6 +1262,7 @@ TEST(capped_rays_are_counted_and_count_as_tau)
     }
     result_begin(&expected, &s);
     result_begin(&got, &s);
+    for (int i = 0; i < PIXELS; i++) tilt_at(&s, i, (double)a.distance[i], (double)w[i], &expected);
     backward(&s, &how, w, &got, &a, &stats);
     adjoint_at(&s, n, points, seeds, &expected);
     CHECK(capped > 20);
@@ -1277,6 +1424,8 @@ TEST(a_gradient_does_not_depend_on_which_others_are_wanted)
             if (group == CODE) one.grads.code = grads.code;
             if (group == ROTATION) one.grads.rotation = grads.rotation;
             if (group == TRANSLATION) one.grads.translation = grads.translation;
+            if (group == FOCAL) one.grads.focal = grads.focal;
+            if (group == PRINCIPAL) one.grads.principal = grads.principal;
             if (group == WEIGHTS) one.grads.weights = grads.weights;
             backward(&s, &how, w, &one, &a, &stats);
             CHECK_BYTES((size_t)slots(&s, group) * sizeof(float), result_group(&all, group), result_group(&one, group));
@@ -1315,9 +1464,11 @@ TEST(what_backward_cannot_do_is_refused)
     CHECK_STATUS(DIST_UNSUPPORTED, dist_render_backward(s.ctx, tape, &d_out, &grads), s.ctx);
     CHECK_STATUS(DIST_UNSUPPORTED, dist_field_backward(s.ctx, &s.field, 1, x, w, NULL, NULL, NULL, &grads), s.ctx);
     grads.weights = NULL;
-    grads.rotation = w; /* there is no camera */
-    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_backward(s.ctx, &s.field, 1, x, w, NULL, NULL, NULL, &grads), s.ctx);
-    grads.rotation = NULL;
+    for (int i = 0; i < 4; i++) { /* there is no camera */
+        *(i == 0 ? &grads.rotation : i == 1 ? &grads.translation : i == 2 ? &grads.focal : &grads.principal) = w;
+        CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_backward(s.ctx, &s.field, 1, x, w, NULL, NULL, NULL, &grads), s.ctx);
+        no_camera(&grads);
+    }
     CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_backward(s.ctx, &s.field, 1, NULL, w, NULL, NULL, NULL, &grads), s.ctx);
     CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_backward(s.ctx, &s.field, 1, x, NULL, NULL, NULL, NULL, &grads), s.ctx);
     CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_backward(s.ctx, NULL, 1, x, w, NULL, NULL, NULL, &grads), s.ctx);
@@ -1362,7 +1513,7 @@ TEST(gradients_have_the_same_bits_for_every_number_of_workers)
             CHECK_STATUS(DIST_OK, dist_render(s.ctx, &s.field, &s.camera, &how, &out, tape), s.ctx);
             CHECK_STATUS(DIST_OK, dist_render_backward(s.ctx, tape, &d_out, &image[at].grads), s.ctx);
             dist_gradients grads = field[at].grads;
-            grads.rotation = grads.translation = NULL;
+            no_camera(&grads);
             CHECK_STATUS(DIST_OK,
                          dist_field_backward(s.ctx, &s.field, MANY, points, d_sdf, NULL, NULL, pulled[at], &grads),
                          s.ctx);
@@ -1435,7 +1586,7 @@ static int scene_real(scene *s, const char *name)
     s->field = dist_shape_field(s->shape);
     s->code_size = s->field.code_size;
     s->camera = dist_camera_look_at(128, 128, (float)(50.0 * 3.14159265358979323846 / 180.0), eye, at, up);
-    for (int i = 0; i < 3; i++) s->translation[i] = (double)s->camera.translation[i];
+    scene_numbers(s);
     return CHECK_STATUS(DIST_OK, dist_context_status(s->ctx), s->ctx);
 }
 
@@ -1731,6 +1882,7 @@ int main(int argc, char **argv)
     RUN(silhouette_backward_at_misses_is_the_derivative_at_the_sample);
     RUN(silhouette_backward_at_misses_is_near_the_derivative_of_the_least_value);
     RUN(silhouette_backward_off_the_sphere_moves_only_the_camera);
+    RUN(silhouette_backward_with_the_sphere_behind_the_camera_matches_differences);
     RUN(analytic_normal_backward_in_camera_space_matches_differences);
     RUN(analytic_normal_backward_in_world_space_matches_differences);
     RUN(difference_normal_backward_in_camera_space_matches_differences);

@@ -343,7 +343,10 @@ static double trainer_step(trainer *t, double done)
         size_t k = trainer_next(t);
         float *code = t->codes + k * t->code_size;
         clamped_loss l = {t->target, t->loss, clamp_limit, 1.0f / (float)batch};
-        dist_gradients grads = {t->d_code, NULL, NULL, t->d_weights};
+        dist_gradients grads;
+        memset(&grads, 0, sizeof grads);
+        grads.code = t->d_code;
+        grads.weights = t->d_weights;
         pool_draw(&t->pools[k], &t->random, batch, t->points, t->target);
         memset(t->d_code, 0, t->code_size * sizeof(float));
         dist_loss_code(t->code_size, code, prior, t->d_code);
@@ -446,7 +449,9 @@ static void fit_code(dist_context *ctx, const settings *how, const dist_net *net
     rng r = rng_begin(how->seed);
     for (int i = 0; i < how->iterations; i++) {
         clamped_loss l = {target, loss, clamp_limit, 1.0f / FIT_BATCH};
-        dist_gradients grads = {d_code, NULL, NULL, NULL};
+        dist_gradients grads;
+        memset(&grads, 0, sizeof grads);
+        grads.code = d_code;
         adam.rate = 0.01f * (float)pow(0.5, 6 * i / how->iterations);
         memset(d_code, 0, n * sizeof(float));
         dist_loss_code(n, code, how->prior, d_code);

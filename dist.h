@@ -348,7 +348,8 @@ enum { DIST_INSIDE_BACKGROUND = 0, DIST_INSIDE_HIT = 1, DIST_INSIDE_EXIT = 2 };
 enum {
     DIST_RAY_MISS = 0,   /* nothing there */
     DIST_RAY_HIT,        /* the distance is within its error bound */
-    DIST_RAY_UNRESOLVED, /* step budget spent: mask 0, distance of the sample of smallest |f| */
+    DIST_RAY_UNRESOLVED, /* budget spent: mask 0, distance of the sample of smallest |f|, or where neighbors or cones
+                            say; a surface, if there is one, is no farther from there than the error */
     DIST_RAY_INSIDE,     /* started inside the solid: as how.inside says */
     DIST_RAY_PLATEAU,    /* f is small and flat: no crossing within reach; mask 0 */
     DIST_RAY_NOT_FINITE, /* the field gave NaN or infinity: mask 0 */
@@ -375,6 +376,11 @@ typedef struct dist_render_desc {
     int no_prediction;   /* 1: no ray starts from what its neighbors found */
     /* (height, width): only pixels that are not 0 are traced. Read during dist_render; NULL: all. dist_trace: NULL */
     const unsigned char *pixels;
+    unsigned long long max_queries; /* queries of one call at most; 0: no limit. Shared out over the tiles by their
+                            pixels in the bounding sphere's rectangle (dist_trace: over groups of 1024 rays), so the
+                            bits do not depend on threads; a tile spends its share on cones first, then on every 8th
+                            pixel, 4th and so on, and keeps what its hits' normals and colors cost. Rays that it does
+                            not finish are UNRESOLVED */
 } dist_render_desc;
 
 /* What will be used: every 0 replaced by its default. */
@@ -416,14 +422,14 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
 /* Planes of width * height entries, top row first; NULL: not computed. As d_out of dist_render_backward the float
    planes hold dL/d(plane) and are only read. */
 typedef struct dist_images {
-    float *depth;          /* z in camera space */
-    float *distance;       /* along the ray */
+    float *depth;          /* z in camera space; how.background where the ray is neither a hit nor UNRESOLVED */
+    float *distance;       /* along the ray; likewise */
     float *normal;         /* (h, w, 3), unit, outward; 0 at a miss */
     float *silhouette;     /* min |f| along the ray - epsilon, signed: < 0 at a hit, > 0 at a miss */
     float *color;          /* (h, w, 3) */
     unsigned char *mask;   /* 1 hit, 0 not: the authority */
     unsigned char *status; /* DIST_RAY_* */
-    float *error;          /* bound on the error of distance; 0 at a miss */
+    float *error;          /* bound on the error of distance; 0 where that is the background */
     dist_stats *stats;
 } dist_images;
 
@@ -435,7 +441,8 @@ DIST_API void dist_tape_destroy(dist_tape *tape);
 
 /* Traces one ray per pixel and fills the planes that are not NULL. desc and tape may be NULL.
    The tape borrows what the field points to until its last dist_render_backward. No allocator call.
-   Rays that miss: mask 0, depth and distance desc->background, normal 0, silhouette > 0. */
+   Rays that miss: mask 0, depth and distance desc->background, normal 0, silhouette > 0. UNRESOLVED: mask 0, normal 0,
+   depth and distance the best so far. */
 DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, const dist_camera *camera,
                                  const dist_render_desc *desc, const dist_images *out, dist_tape *tape);
 
@@ -5330,6 +5337,17 @@ static int disti_ray_end(disti_ray *ray, int status, float s, float f, float err
     return 0;
 }
 
+/* Ends a ray whose budget is spent: its best sample, or without one where it would look next. What lies before the
+   front is known to be empty; a bracket says more. */
+static int disti_ray_give_up(disti_ray *ray)
+{
+    int mode = ray->mode, begun = mode >= DISTI_MARCH && mode <= DISTI_BRACKET && mode != DISTI_BACK;
+    float front = mode == DISTI_BRACKET ? ray->a : mode == DISTI_BACK ? ray->enter : begun ? ray->s : ray->start;
+    float end = mode == DISTI_BRACKET || (begun && ray->fb < 0.0f && ray->b > ray->s) ? ray->b : ray->leave;
+    float s = ray->fbest < 2e38f ? ray->best : ray->q;
+    return disti_ray_end(ray, DIST_RAY_UNRESOLVED, s, ray->fbest * ray->sign, DISTI_MAX(s - front, end - s));
+}
+
 static int disti_ray_ask(disti_ray *ray, int mode, float q)
 {
     ray->mode = (unsigned char)mode;
@@ -5553,8 +5571,7 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
     }
     if (ray->steps >= tracer->how.max_steps && f > 0.0f && ray->mode != DISTI_BAND && ray->fb < 0.0f && ray->b > ray->s)
         return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->b, ray->fb);
-    if (ray->steps >= tracer->how.max_steps && f > 0.0f)
-        return disti_ray_end(ray, DIST_RAY_UNRESOLVED, ray->best, ray->fbest * ray->sign, 0.0f);
+    if (ray->steps >= tracer->how.max_steps && f > 0.0f) return disti_ray_give_up(ray);
     switch (ray->mode) {
     case DISTI_FIRST:
         if (f < 0.0f && q <= ray->enter) return disti_ray_inside(tracer, ray, f);
@@ -5644,8 +5661,16 @@ typedef struct disti_balls {
     float ball[DISTI_BALL_LISTS][DISTI_BALLS][4]; /* center, radius */
 } disti_balls;
 
+/* A task's share of how.max_queries. Each hit owes per_hit queries for its normal and color, so while marching a query
+   that may find one must leave room for them. */
+typedef struct disti_budget {
+    unsigned long long left, hits, per_hit;
+    int marching;
+} disti_budget;
+
 typedef struct disti_bench { /* the work bench of one task */
     dist_stats *stats;
+    disti_budget *budget; /* NULL: no limit */
     disti_ray *rays;   /* DISTI_TILE_RAYS */
     float *points;     /* (DISTI_TILE_RAYS, 3) */
     float *sdf;        /* DISTI_TILE_RAYS */
@@ -5668,8 +5693,32 @@ static void disti_bench_init(const dist_context *ctx, int worker, disti_bench *b
     bench->index = (int *)disti_take(base, &at, DISTI_TILE_RAYS, sizeof(int));
     bench->rest = (unsigned char *)disti_take(base, &at, DISTI_REST_BYTES, 1);
     bench->balls = NULL;
+    bench->budget = NULL;
     bench->width = bench->publish = 0;
     DIST_ASSERT(at <= DISTI_TRACE_BYTES);
+}
+
+/* What of how.max_queries goes to the first `part` of `whole` equal parts. Differences of it are the tasks' shares, so
+   their sum is exact. */
+static unsigned long long disti_share(const disti_tracer *tracer, double part, double whole)
+{
+    unsigned long long most = DISTI_MIN(tracer->how.max_queries, 1ull << 53);
+    return part >= whole ? most : (unsigned long long)((double)most * (part / whole));
+}
+
+/* Evaluates f at the first `count` of bench->points, or at as many as the budget has room for; returns how many. */
+static size_t disti_query(const disti_tracer *tracer, int worker, const disti_bench *bench, size_t count)
+{
+    disti_budget *budget = bench->budget;
+    if (budget) {
+        unsigned long long owed = budget->hits * budget->per_hit, room = budget->left > owed ? budget->left - owed : 0;
+        if (budget->marching) room /= 1 + budget->per_hit;
+        count = (size_t)DISTI_MIN((unsigned long long)count, room);
+        budget->left -= count;
+    }
+    if (count > 0) tracer->field->eval_fn(tracer->field->user, worker, count, bench->points, bench->sdf, NULL);
+    bench->stats->queries += count;
+    return count;
 }
 
 static void disti_ray_point(const disti_ray *ray, float s, float p[3])
@@ -5730,7 +5779,14 @@ static int disti_skip(const disti_bench *bench, int index, disti_ray *ray)
     return 1;
 }
 
-/* Marches the `active` rays listed in bench->index, in rounds: one packed batch of points a round. */
+/* Mask of a finished ray: a hit, or a start inside the solid where that counts as one. */
+static int disti_ray_is_hit(const disti_tracer *tracer, const disti_ray *ray)
+{
+    return ray->status == DIST_RAY_HIT || (ray->status == DIST_RAY_INSIDE && tracer->how.inside == DIST_INSIDE_HIT);
+}
+
+/* Marches the `active` rays listed in bench->index, in rounds: one packed batch of points a round. Without budget they
+   stay as they are. */
 static void disti_trace_rounds(const disti_tracer *tracer, int worker, const disti_bench *bench, size_t active)
 {
     while (active > 0) {
@@ -5741,18 +5797,18 @@ static void disti_trace_rounds(const disti_tracer *tracer, int worker, const dis
             disti_ray_point(ray, ray->q, bench->points + 3 * kept);
             bench->index[kept++] = bench->index[i];
         }
+        size_t asked = disti_query(tracer, worker, bench, kept);
         active = kept;
         kept = 0;
-        if (active == 0) return;
-        tracer->field->eval_fn(tracer->field->user, worker, active, bench->points, bench->sdf, NULL);
-        bench->stats->queries += active;
-        for (size_t i = 0; i < active; i++) {
+        for (size_t i = 0; i < asked; i++) {
             disti_ray *ray = &bench->rays[bench->index[i]];
             if (ray->mode >= DISTI_BAND) bench->stats->refine_queries++;
             else bench->stats->march_queries++;
             if (bench->publish) disti_publish(tracer, bench, bench->index[i], bench->points + 3 * i, bench->sdf[i]);
             if (disti_ray_advance(tracer, ray, bench->sdf[i])) bench->index[kept++] = bench->index[i];
+            else if (bench->budget) bench->budget->hits += (unsigned)disti_ray_is_hit(tracer, ray);
         }
+        if (asked < active) return;
         active = kept;
     }
 }
@@ -5764,6 +5820,13 @@ static void disti_trace_all(const disti_tracer *tracer, int worker, const disti_
     for (size_t i = 0; i < n; i++)
         if (bench->rays[i].mode != DISTI_DONE) bench->index[active++] = (int)i;
     disti_trace_rounds(tracer, worker, bench, active);
+}
+
+/* Ends the rays for which no budget was left. */
+static void disti_trace_end(const disti_bench *bench, size_t n)
+{
+    for (size_t i = 0; i < n && bench->budget; i++)
+        if (bench->rays[i].mode != DISTI_DONE) disti_ray_give_up(&bench->rays[i]);
 }
 
 static void disti_stats_begin(dist_context *ctx)
@@ -5806,12 +5869,6 @@ static void disti_stats_end(dist_context *ctx, const disti_tracer *tracer, dist_
     }
     if (out->epsilon > 1e38f) out->epsilon = tracer->epsilon > 0.0f ? tracer->epsilon : 5e-5f * tracer->field->radius;
     out->lipschitz = tracer->lipschitz;
-}
-
-/* Mask of a finished ray: a hit, or a start inside the solid where that counts as one. */
-static int disti_ray_is_hit(const disti_tracer *tracer, const disti_ray *ray)
-{
-    return ray->status == DIST_RAY_HIT || (ray->status == DIST_RAY_INSIDE && tracer->how.inside == DIST_INSIDE_HIT);
 }
 
 static void disti_stats_ray(const disti_tracer *tracer, const disti_ray *ray, dist_stats *stats)
@@ -5858,7 +5915,13 @@ static void disti_free_task(void *arg, int index, int worker)
         disti_ray_init(job->tracer->field, o, d, 0.0, &bench.rays[i]);
         if (!good) disti_ray_end(&bench.rays[i], DIST_RAY_NOT_FINITE, 0.0f, 0.0f, 0.0f);
     }
+    disti_budget budget;
+    memset(&budget, 0, sizeof budget);
+    budget.left = disti_share(job->tracer, (double)(first + n), (double)job->n) -
+                  disti_share(job->tracer, (double)first, (double)job->n);
+    if (job->tracer->how.max_queries > 0) bench.budget = &budget;
     disti_trace_all(job->tracer, worker, &bench, n);
+    disti_trace_end(&bench, n);
     for (size_t i = 0; i < n; i++) {
         const disti_ray *ray = &bench.rays[i];
         dist_hit *hit = job->hits + first + i;
@@ -6018,9 +6081,10 @@ static void disti_cone_rounds(const disti_tracer *tracer, int worker, const dist
 {
     size_t active = 0;
     for (int i = 0; i < count; i++) {
-        cones[i].blocked = cones[i].rays < DISTI_CONE_RAYS;
-        if (cones[i].blocked) cones[i].f = 3e38f; /* no sample */
-        else if (cones[i].enter <= cones[i].leave && cones[i].t < cones[i].leave) bench->index[active++] = i;
+        cones[i].blocked = cones[i].enter <= cones[i].leave && cones[i].t < cones[i].leave;
+        cones[i].f = 3e38f; /* no sample */
+        if (cones[i].rays < DISTI_CONE_RAYS) cones[i].blocked = 1;
+        else if (cones[i].blocked) bench->index[active++] = i;
     }
     for (int round = 0; active > 0; round++) {
         size_t kept = 0;
@@ -6028,8 +6092,7 @@ static void disti_cone_rounds(const disti_tracer *tracer, int worker, const dist
             const disti_cone *cone = &cones[bench->index[i]];
             disti_ray_point(&cone->axis, (float)(cone->t - cone->axis.base), bench->points + 3 * i);
         }
-        tracer->field->eval_fn(tracer->field->user, worker, active, bench->points, bench->sdf, NULL);
-        bench->stats->queries += active;
+        active = disti_query(tracer, worker, bench, active);
         bench->stats->cone_queries += active;
         for (size_t i = 0; i < active; i++)
             if (disti_cone_advance(tracer, &cones[bench->index[i]], bench->sdf[i]) && round < 64)
@@ -6195,13 +6258,12 @@ static void disti_keep_least(disti_ray *ray, float s, float f)
     ray->fbest = f;
 }
 
-/* Evaluates `count` points of bench->points for the silhouette. */
-static void disti_silhouette_eval(const disti_tracer *tracer, int worker, const disti_bench *bench, size_t count)
+/* Evaluates `count` points of bench->points for the silhouette, or as many as the budget has room for. */
+static size_t disti_silhouette_eval(const disti_tracer *tracer, int worker, const disti_bench *bench, size_t count)
 {
-    if (count == 0) return;
-    tracer->field->eval_fn(tracer->field->user, worker, count, bench->points, bench->sdf, NULL);
-    bench->stats->queries += count;
+    count = disti_query(tracer, worker, bench, count);
     bench->stats->silhouette_queries += count;
+    return count;
 }
 
 /* s of the least of the parabola through (-h, left), (0, middle), (h, right), within (-h, h). */
@@ -6240,7 +6302,7 @@ static void disti_silhouette_probe(const disti_tracer *tracer, int worker, const
         bench->index[2 * probes + 1] = block;
         probes++;
     }
-    disti_silhouette_eval(tracer, worker, bench, probes * DISTI_PROBES);
+    probes = disti_silhouette_eval(tracer, worker, bench, probes * DISTI_PROBES) / DISTI_PROBES;
     for (size_t i = 0; i < probes; i++) {
         disti_ray *ray = &bench->rays[bench->index[2 * i]];
         const float *f = bench->sdf + i * DISTI_PROBES;
@@ -6271,7 +6333,7 @@ static void disti_silhouette(const disti_tracer *tracer, int worker, const disti
         disti_ray_point(ray, ray->q, bench->points + 3 * count);
         bench->index[count++] = i;
     }
-    disti_silhouette_eval(tracer, worker, bench, count);
+    count = disti_silhouette_eval(tracer, worker, bench, count);
     for (size_t k = 0; k < count; k++)
         disti_keep_least(&bench->rays[bench->index[k]], bench->rays[bench->index[k]].q, bench->sdf[k]);
     for (int round = 0; round < 6; round++) { /* left, right, where the parabola is least; again, four times finer */
@@ -6296,8 +6358,9 @@ static void disti_silhouette(const disti_tracer *tracer, int worker, const disti
             disti_ray_point(ray, ray->q, bench->points + 3 * count);
             bench->index[count++] = i;
         }
-        disti_silhouette_eval(tracer, worker, bench, count);
-        for (size_t k = 0; k < count; k++) {
+        size_t asked = disti_silhouette_eval(tracer, worker, bench, count);
+        for (size_t k = asked; k < count; k++) bench->rays[bench->index[k]].width = 0.0f;
+        for (size_t k = 0; k < asked; k++) {
             disti_ray *ray = &bench->rays[bench->index[k]];
             if (phase == 0) ray->b = bench->sdf[k];
             if (phase == 1) ray->fb = bench->sdf[k];
@@ -6369,9 +6432,7 @@ static void disti_paper_coarse(const disti_tracer *tracer, int worker, const dis
             disti_ray_point(&rays[i].ray, rays[i].ray.s, bench->points + 3 * count);
             bench->index[count++] = (int)i;
         }
-        if (count == 0) return;
-        tracer->field->eval_fn(tracer->field->user, worker, count, bench->points, bench->sdf, NULL);
-        bench->stats->queries += count;
+        count = disti_query(tracer, worker, bench, count);
         bench->stats->cone_queries += count;
         for (size_t k = 0; k < count; k++) {
             disti_paper_ray *r = &rays[bench->index[k]];
@@ -6420,14 +6481,20 @@ static void disti_paper_finish(const disti_tracer *tracer, disti_ray *ray)
     int first = tracer->how.paper_row == DIST_PAPER_COARSE_TO_FINE || ray->a > epsilon;
     int before = ray->s < ray->leave;
     float f = ray->fbest, magnitude = f < 0.0f ? -f : f;
+    if (ray->steps == 0) { /* without budget: its parent's sample */
+        ray->q = ray->best;
+        disti_ray_give_up(ray);
+        return;
+    }
     ray->mode = DISTI_DONE;
     ray->status = DIST_RAY_MISS;
     if (!disti_finite(ray->f)) ray->status = DIST_RAY_NOT_FINITE;
     else if (before && ray->fa <= epsilon && first) ray->status = DIST_RAY_HIT;
     else if (before && !first && ray->a < 0.0f) ray->status = DIST_RAY_INSIDE;
     else if (before) ray->status = DIST_RAY_UNRESOLVED;
-    ray->error = magnitude;
-    ray->q = ray->best; /* where the smallest |f| was met */
+    ray->error = before && ray->status == DIST_RAY_UNRESOLVED
+                     ? DISTI_MAX(ray->leave - ray->best, ray->best - ray->enter) /* steps may have gone too far */
+                     : magnitude;
     if (ray->status == DIST_RAY_HIT) ray->best += disti_clamp(f, 0.1f * tracer->field->radius);
 }
 
@@ -6437,6 +6504,8 @@ static void disti_paper_trace(const disti_tracer *tracer, int worker, const dist
 {
     size_t n = (size_t)(tile->width * tile->height), kept = (size_t)tracer->how.samples * 4;
     int row = tracer->how.paper_row, steps = tracer->how.max_steps;
+    if (bench->budget && bench->budget->per_hit > 0) /* what all rays would owe, but at most half of it */
+        bench->budget->hits = DISTI_MIN((unsigned long long)n, bench->budget->left / 2 / bench->budget->per_hit);
     int pyramid = row == DIST_PAPER_COARSE_TO_FINE;
     float alpha = disti_paper_alpha(&tracer->how);
     disti_paper_ray *quarter = (disti_paper_ray *)(void *)bench->rest, *half = quarter + 64;
@@ -6470,9 +6539,8 @@ static void disti_paper_trace(const disti_tracer *tracer, int worker, const dist
             disti_ray_point(ray, ray->s, bench->points + 3 * count);
             bench->index[count++] = (int)i;
         }
+        count = disti_query(tracer, worker, bench, count);
         if (count == 0) break;
-        tracer->field->eval_fn(tracer->field->user, worker, count, bench->points, bench->sdf, NULL);
-        bench->stats->queries += count;
         bench->stats->march_queries += count;
         for (size_t k = 0; k < count; k++) {
             size_t i = (size_t)bench->index[k], x = i % (size_t)tile->width, y = i / (size_t)tile->width;
@@ -6480,8 +6548,13 @@ static void disti_paper_trace(const disti_tracer *tracer, int worker, const dist
             disti_paper_step(tracer, &bench->rays[i], mine, alpha, bench->sdf[k], bench->points + 3 * k);
         }
     }
-    for (size_t i = 0; i < n; i++)
-        if (bench->rays[i].mode != DISTI_DONE) disti_paper_finish(tracer, &bench->rays[i]);
+    unsigned long long hits = 0;
+    for (size_t i = 0; i < n; i++) {
+        disti_ray *ray = &bench->rays[i];
+        if (ray->mode != DISTI_DONE) disti_paper_finish(tracer, ray);
+        if (!bench->budget || !disti_ray_is_hit(tracer, ray)) continue;
+        if (++hits * bench->budget->per_hit > bench->budget->left) ray->status = DIST_RAY_UNRESOLVED;
+    }
 }
 #endif
 
@@ -6611,7 +6684,59 @@ typedef struct disti_render_job {
     int tile, across;
     int predict; /* pixels start from what their neighbors found */
     size_t first[DISTI_LIST_TASKS + 1]; /* disti_render_list: first pixel of each task */
+    size_t each;                        /* and how many of them each has */
+    int count;                          /* tasks */
+    int box[4];  /* left, top, right, bottom: pixels that may see the bounding sphere */
 } disti_render_job;
+
+/* How far the sphere (center c in camera space) reaches in units of tan, times focal: k with |a - k c_z| <= radius
+   sqrt(focal^2 + k^2), the planes through the camera that meet it, a = focal times its own tan times c_z. */
+static void disti_sphere_reach(double a, double focal, double depth, double radius, double first, int side, int *low,
+                               int *high)
+{
+    double square = depth * depth - radius * radius;
+    *low = 0;
+    *high = side;
+    if (!(depth > radius) || !(square > 0.0)) return;
+    double root = radius * sqrt(a * a + focal * focal * square);
+    double least = first + (a * depth - root) / square - 1.0, most = first + (a * depth + root) / square + 2.0;
+    *low = (int)DISTI_MIN(DISTI_MAX(least, 0.0), (double)side);
+    *high = (int)DISTI_MIN(DISTI_MAX(most, (double)*low), (double)side);
+}
+
+static void disti_sphere_box(const disti_view *view, const dist_field *field, int box[4])
+{
+    double c[3], away[3], radius = (double)field->radius;
+    for (int i = 0; i < 3; i++) away[i] = (double)field->center[i] - view->center[i];
+    disti_rotate(view->rotation, away, c);
+    disti_sphere_reach(view->fx * c[0] + view->skew * c[1], sqrt(view->fx * view->fx + view->skew * view->skew), c[2],
+                       radius, view->cx - view->first, view->width, &box[0], &box[2]);
+    disti_sphere_reach(view->fy * c[1], view->fy, c[2], radius, view->cy - view->first, view->height, &box[1], &box[3]);
+}
+
+static double disti_overlap(int low, int high, int first, int end)
+{
+    return (double)DISTI_MAX(0, DISTI_MIN(high, end) - DISTI_MAX(low, first));
+}
+
+static void disti_budget_init(const disti_render_job *job, double before, double mine, double all, disti_budget *budget)
+{
+    memset(budget, 0, sizeof *budget);
+    budget->left = all > 0.0 ? disti_share(job->tracer, before + mine, all) - disti_share(job->tracer, before, all) : 0;
+    if (job->out->normal) budget->per_hit += job->tracer->how.normal_mode == DIST_NORMAL_ANALYTIC ? 1 : 6;
+    budget->per_hit += job->out->color != NULL;
+}
+
+/* The tile's share: pixels in the box, counted through the tiles in their order. */
+static void disti_render_budget(const disti_render_job *job, const disti_tile *tile, disti_budget *budget)
+{
+    const int *box = job->box;
+    double wide = (double)(box[2] - box[0]), rows = disti_overlap(box[1], box[3], tile->y, tile->y + tile->height);
+    double before = wide * disti_overlap(box[1], box[3], 0, tile->y) +
+                    rows * disti_overlap(box[0], box[2], 0, tile->x);
+    double mine = rows * disti_overlap(box[0], box[2], tile->x, tile->x + tile->width);
+    disti_budget_init(job, before, mine, wide * (double)(box[3] - box[1]), budget);
+}
 
 /* Gradients of f at up to DISTI_GRADIENTS hit points at a time. */
 enum { DISTI_GRADIENTS = 1024 };
@@ -6721,6 +6846,7 @@ static float disti_ray_silhouette(const disti_tracer *tracer, const disti_ray *r
     float f = ray->fbest, magnitude = f < 0.0f ? -f : f;
     float epsilon = disti_ray_epsilon(tracer, ray, ray->best);
     if (ray->status == DIST_RAY_NOT_FINITE) return epsilon;
+    if (magnitude > 2e38f) return tracer->lipschitz * field->radius; /* no sample: no more is known than this bound */
     if (disti_ray_is_hit(tracer, ray))
         return DISTI_MIN((tracer->how.trace == DIST_TRACE_PAPER ? f : magnitude) - epsilon, -tiny);
     return DISTI_MAX(magnitude - epsilon, tiny);
@@ -6732,17 +6858,18 @@ static void disti_render_pixel(const disti_render_job *job, const disti_ray *ray
     const disti_tracer *tracer = job->tracer;
     const dist_images *out = job->out;
     int hit = disti_ray_is_hit(tracer, ray), skipped = ray->status == DIST_RAY_SKIPPED;
+    int placed = hit || ray->status == DIST_RAY_UNRESOLVED;
     double distance = ray->base + (double)ray->best, local[3];
     if (out->depth) {
-        if (hit) disti_view_direction(job->view, (int)(pixel % (size_t)job->view->width),
-                                      (int)(pixel / (size_t)job->view->width), local);
-        out->depth[pixel] = hit ? (float)(distance * local[2]) : tracer->how.background;
+        if (placed) disti_view_direction(job->view, (int)(pixel % (size_t)job->view->width),
+                                         (int)(pixel / (size_t)job->view->width), local);
+        out->depth[pixel] = placed ? (float)(distance * local[2]) : tracer->how.background;
     }
-    if (out->distance) out->distance[pixel] = hit ? (float)distance : tracer->how.background;
+    if (out->distance) out->distance[pixel] = placed ? (float)distance : tracer->how.background;
     if (out->silhouette) out->silhouette[pixel] = skipped ? 0.0f : disti_ray_silhouette(tracer, ray);
     if (out->mask) out->mask[pixel] = (unsigned char)hit;
     if (out->status) out->status[pixel] = ray->status;
-    if (out->error) out->error[pixel] = hit ? ray->error : 0.0f;
+    if (out->error) out->error[pixel] = placed ? ray->error : 0.0f;
     if (out->normal) out->normal[3 * pixel] = out->normal[3 * pixel + 1] = out->normal[3 * pixel + 2] = 0.0f;
     if (out->color) memcpy(out->color + 3 * pixel, tracer->how.background_color, 3 * sizeof(float));
     if (!job->tape) return;
@@ -6793,6 +6920,9 @@ static void disti_render_task(void *arg, int index, int worker)
     tile.y = index / job->across * job->tile;
     tile.own_width = tile.width = DISTI_MIN(job->tile, job->view->width - tile.x);
     tile.own_height = tile.height = DISTI_MIN(job->tile, job->view->height - tile.y);
+    disti_budget budget;
+    disti_render_budget(job, &tile, &budget);
+    if (tracer->how.max_queries > 0) bench.budget = &budget;
     int predict = job->predict;
     if (predict && tile.x + tile.width < job->view->width) tile.width++;
     if (predict && tile.y + tile.height < job->view->height) tile.height++;
@@ -6811,11 +6941,17 @@ static void disti_render_task(void *arg, int index, int worker)
     } else
 #endif
     {
+        unsigned long long kept = job->out->silhouette ? budget.left / 4 : 0; /* for the silhouette of misses */
+        budget.left -= kept;
         if (!tracer->how.no_cones)
             disti_cones(tracer, worker, &tile, &bench, predict ? (int)DISTI_LATTICE : (int)DISTI_CONE_LEAF);
+        budget.marching = 1;
         if (predict) disti_trace_lattice(tracer, worker, &tile, &bench);
         else disti_trace_all(tracer, worker, &bench, (size_t)n);
+        budget.marching = 0;
         disti_tile_trim(&tile, &bench);
+        disti_trace_end(&bench, (size_t)(tile.width * tile.height));
+        budget.left += kept;
         if (job->out->silhouette) disti_silhouette(tracer, worker, &tile, &bench);
     }
     disti_render_planes(job, &tile, &bench);
@@ -6836,7 +6972,7 @@ static int disti_render_list(const disti_tracer *tracer, const disti_view *view,
         pairs += pixels[i] && i + 1 < n && pixels[i + 1];
     }
     if (8 * pairs > wanted) return 0;
-    size_t each = DISTI_MAX(wanted / DISTI_LIST_TASKS + 1, (size_t)DISTI_LIST_RAYS / 16);
+    size_t each = job->each = DISTI_MAX(wanted / DISTI_LIST_TASKS + 1, (size_t)DISTI_LIST_RAYS / 16);
     int count = 1;
     job->first[0] = 0;
     for (size_t i = 0, seen = 0; i < n; i++) {
@@ -6855,8 +6991,10 @@ static void disti_render_list_task(void *arg, int index, int worker)
     disti_bench bench;
     disti_tile tile;
     disti_ray skipped;
-    double local[3];
+    disti_budget budget;
+    double local[3], done = (double)index * (double)job->each;
     disti_bench_init(tracer->ctx, worker, &bench);
+    if (tracer->how.max_queries > 0) bench.budget = &budget;
     disti_ray_skip(&skipped);
     memset(&tile, 0, sizeof tile);
     size_t *list = (size_t *)(void *)(bench.rest + DISTI_REST_BYTES - DISTI_LIST_RAYS * sizeof(size_t));
@@ -6871,7 +7009,11 @@ static void disti_render_list_task(void *arg, int index, int worker)
             disti_pixel_ray(job->view, tracer->field, (int)(i % (size_t)job->view->width),
                             (int)(i / (size_t)job->view->width), local, &bench.rays[tile.width++]);
         }
+        disti_budget_init(job, done, (double)tile.width, (double)job->count * (double)job->each, &budget);
+        budget.marching = 1;
+        done += (double)tile.width;
         disti_trace_all(tracer, worker, &bench, (size_t)tile.width);
+        disti_trace_end(&bench, (size_t)tile.width);
         disti_render_planes(job, &tile, &bench);
         if (job->out->normal) disti_render_normals(job, worker, &tile, &bench);
         if (job->out->color) disti_render_colors(job, worker, &tile, &bench);
@@ -6921,8 +7063,9 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     job.across = (view.width + job.tile - 1) / job.tile;
     job.predict = disti_render_predicts(&tracer, &view);
     int listed = disti_render_list(&tracer, &view, &job);
-    int count = listed ? listed : job.across * ((view.height + job.tile - 1) / job.tile);
-    disti_run(ctx, count, listed ? disti_render_list_task : disti_render_task, &job);
+    job.count = listed ? listed : job.across * ((view.height + job.tile - 1) / job.tile);
+    disti_sphere_box(&view, field, job.box);
+    disti_run(ctx, job.count, listed ? disti_render_list_task : disti_render_task, &job);
     disti_stats_end(ctx, &tracer, out->stats);
     if (!tape) return DIST_OK;
     tape->rendered = 1;

@@ -176,6 +176,9 @@ static inline observation observe_field(dist_context *ctx, const dist_field *fie
     out.mask = s.mask;
     dist_render(ctx, field, camera, NULL, &out, NULL);
     check(ctx);
+    for (size_t i = 0; i < s.n; i++) {
+        if (!s.mask[i]) { s.depth[i] = 0.0f; } /* an unresolved ray's depth is no observation */
+    }
     s.truth = picture_field(ctx, field, camera);
     return s;
 }

@@ -108,6 +108,9 @@ static void write_planes(dist_context *ctx, const job *j, const dist_images *out
     if (j->planes & DEPTH) {
         float range[2];
         depth_range(n, out->depth, out->mask, range);
+        for (size_t i = 0; i < n; i++) {
+            if (!out->mask[i]) { out->depth[i] = 0.0f; } /* the file has no mask beside it */
+        }
         write_plane(ctx, j, "depth", picture_depth(w, h, out->depth, out->mask, range[0], range[1]), 1, out->depth);
     }
     if (j->planes & NORMAL) {

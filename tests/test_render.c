@@ -84,10 +84,11 @@ TEST(planes_mean_what_the_interface_says)
                 CHECK_NEAR(1, length, 1e-5);
                 CHECK(a.error[i] >= 0 && test_finite((double)a.error[i]));
             } else {
-                CHECK_NEAR(-7.5, a.depth[i], 0);
-                CHECK_NEAR(-7.5, a.distance[i], 0);
+                int placed = a.status[i] == DIST_RAY_UNRESOLVED; /* the best sample, and how far from it is unknown */
+                CHECK_NEAR(placed ? z * (double)a.distance[i] : -7.5, a.depth[i], 1e-6);
+                if (placed) CHECK(a.distance[i] > 1 && a.distance[i] < 4 && a.error[i] > 0 && a.error[i] < 2.001f);
+                else CHECK(a.distance[i] <= -7.5f && a.distance[i] >= -7.5f && a.error[i] <= 0);
                 CHECK_NEAR(0, length, 0);
-                CHECK_NEAR(0, a.error[i], 0);
                 CHECK(a.silhouette[i] > 0);
             }
         }
@@ -1047,6 +1048,154 @@ TEST(pixels_not_asked_for_give_no_gradient)
 }
 #endif
 
+/* ---- how.max_queries -------------------------------------------------------------------------------------------- */
+
+/* Whatever the budget: it is kept, what is called a hit is one, what is called a miss is one, and a surface is no
+   farther from an unresolved ray's distance than its error. */
+TEST(a_query_budget_is_kept_and_more_of_it_finds_more)
+{
+    enum { W = 100, H = 70 };
+    const double budgets[11] = {1e-3, 0.1, 0.3, 0.6, 1, 1.5, 2, 4, 10, 100, 1000};
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(W, H);
+    test_shape shape = shape_make(SHAPE_SPHERE, 0.6, 0, 0, 0);
+    dist_field field = shape_field(&shape, 1, 1);
+    static float expected[W * H];
+    int crossing = 0;
+    for (int i = 0; i < W * H; i++) {
+        double o[3], d[3], t0 = 0, t1 = 0;
+        shape_pixel(&camera, i % W, i / W, o, d);
+        shape_crossing c;
+        memset(&c, 0, sizeof c);
+        if (shape_enter(o, d, 1, &t0, &t1)) c = shape_cross(&shape, o, d, t0, t1, 1, 1e-4, 1e-4);
+        expected[i] = c.crosses && c.below > 2e-6 ? (float)c.t : c.crosses || (t1 > t0 && c.least < 1e-4) ? -1.0f : 0.0f;
+        crossing += c.crosses;
+    }
+    for (int k = 0; k < 7; k++) { /* guarded without and with normals and silhouette, and without helpers; the paper's */
+        dist_render_desc how = plain_how();
+        dist_images out = all_planes(&a);
+        int finished = 0;
+        double before = 1e9;
+        if (k != 1) out.normal = NULL;
+        if (k == 0 || k > 4) out.silhouette = NULL;
+        how.no_prediction = k == 2;
+        how.no_cones = k == 3;
+        how.trace = k >= 4 ? DIST_TRACE_PAPER : DIST_TRACE_GUARDED;
+        how.paper_row = k == 6 ? DIST_PAPER_PARALLEL : 0;
+        if (k == 5) out.normal = a.normal, how.normal_mode = DIST_NORMAL_DIFFERENCE;
+        for (int j = 0; j < 11; j++) {
+            int hits = 0, resolved = 0, false_hits = 0, false_misses = 0, far = 0, broken = 0;
+            double sum = 0;
+            how.max_queries = (unsigned long long)(budgets[j] * W * H);
+            shape.queries = 0;
+            CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+            CHECK_EQUAL(shape.queries, a.stats.queries);
+            CHECK(a.stats.queries <= how.max_queries);
+            for (int i = 0; i < W * H; i++) {
+                int unresolved = a.status[i] == DIST_RAY_UNRESOLVED;
+                double off = fabs((double)a.distance[i] - (double)expected[i]);
+                hits += a.mask[i];
+                resolved += !unresolved;
+                broken += !test_finite((double)a.distance[i]) || !test_finite((double)a.error[i]) || a.error[i] < 0;
+                if (out.silhouette)
+                    broken += !test_finite((double)a.silhouette[i]) || fabs((double)a.silhouette[i]) > 2 ||
+                              (a.silhouette[i] < 0) != a.mask[i];
+                if (out.normal) {
+                    const float *n = out.normal + 3 * i;
+                    CHECK_NEAR(a.mask[i], shape_length((double)n[0], (double)n[1], (double)n[2]), 1e-5);
+                }
+                if (expected[i] < 0) continue; /* a touch */
+                false_hits += a.mask[i] && !(expected[i] > 0);
+                false_misses += !a.mask[i] && !unresolved && expected[i] > 0;
+                if (expected[i] > 0) sum += off;
+                if (expected[i] > 0 && (a.mask[i] || unresolved))
+                    far += off > (double)a.error[i] + (k >= 4 ? 1e-4 / 0.05 : 2e-6);
+            }
+            CHECK_EQUAL(0, broken);
+            CHECK_EQUAL(0, false_hits);
+            CHECK(false_misses == 0 || (k >= 4 && false_misses * 100 < crossing)); /* the paper's own */
+            CHECK(far * 20 <= crossing * (k == 4 || k == 5)); /* coarse-to-fine's hits are its parents' */
+            if (!CHECK(resolved >= finished))
+                printf("    case %d, budget %g: %d resolved, %d before\n", k, budgets[j], resolved, finished);
+            if (test_state.verbose)
+                printf("    case %d, %g a ray: %.2f used, %d of %d hit, %d resolved, %d false, %d off, mean error %.5f\n", k, budgets[j],
+                       (double)a.stats.queries / (W * H), hits, crossing, resolved, false_hits + false_misses, far, sum / crossing);
+            CHECK(sum <= 1.001 * before + 1e-3 * crossing);
+            finished = resolved;
+            before = sum;
+            if (j == 10 && k < 4) CHECK(hits * 100 >= crossing * 99 && a.stats.unresolved * 100 <= (unsigned)crossing);
+        }
+    }
+    dist_context_destroy(ctx);
+}
+
+TEST(a_query_budget_gives_the_same_bits_for_every_number_of_workers)
+{
+    static planes first;
+    static unsigned char pixels[90 * 75];
+    for (int i = 0; i < 90 * 75; i++) pixels[i] = i % 7 == 0;
+    for (int k = 0; k < 21; k++) {
+        test_scheduler scheduler;
+        dist_context_desc desc = test_context_desc();
+        test_shape shape = some_shape(k % 3);
+        dist_field field = shape_field(&shape, 1, 1);
+        dist_camera camera = shape_camera(90, 75);
+        dist_render_desc how = plain_how();
+        how.trace = k % 6 >= 3 ? DIST_TRACE_PAPER : DIST_TRACE_GUARDED;
+        how.max_queries = k < 6 ? 700 : k < 12 ? 7000 : k < 18 ? 20000 : 2000;
+        if (k >= 18) how.pixels = pixels;
+        for (int workers = 1; workers <= 3; workers++) {
+            scheduler.workers = workers;
+            scheduler.calls = k;
+            desc.workers = workers;
+            if (workers > 1) desc.scheduler = test_scheduler_hook(&scheduler);
+            dist_context *ctx = dist_context_create(&desc);
+            dist_images out = all_planes(workers == 1 ? &first : &b);
+            if (k >= 18) out.silhouette = NULL;
+            CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+            if (workers > 1) CHECK_BYTES(offsetof(planes, stats), &first, &b);
+            if (workers > 1) CHECK_BYTES(sizeof(dist_stats), &first.stats, &b.stats);
+            CHECK(out.stats->queries <= how.max_queries && out.stats->queries * 2 > how.max_queries * (k < 6));
+            dist_context_destroy(ctx);
+        }
+    }
+}
+
+TEST(a_query_budget_of_free_rays_is_kept)
+{
+    enum { RAYS = 2500 };
+    static float o[3 * RAYS], d[3 * RAYS];
+    static dist_hit hits[RAYS];
+    dist_context *ctx = shape_context();
+    test_random r = test_random_seed(11);
+    test_shape shape = some_shape(1);
+    dist_field field = shape_field(&shape, 1, 1);
+    unsigned long long resolved = 0;
+    for (size_t i = 0; i < RAYS; i++) {
+        test_random_direction(&r, o + 3 * i);
+        for (size_t k = 0; k < 3; k++) {
+            o[3 * i + k] *= 1.5f;
+            d[3 * i + k] = test_random_float(&r, -0.5f, 0.5f) - o[3 * i + k];
+        }
+    }
+    for (int j = 0; j < 6; j++) {
+        const unsigned long long budgets[6] = {1, 2500, 5000, 10000, 20000, 1000000};
+        dist_render_desc how = plain_how();
+        dist_stats stats;
+        how.max_queries = budgets[j];
+        CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, RAYS, o, d, &how, hits, &stats), ctx);
+        CHECK(stats.queries <= budgets[j]);
+        CHECK(RAYS - stats.unresolved >= resolved);
+        resolved = RAYS - stats.unresolved;
+        for (int i = 0; i < RAYS; i++) {
+            if (hits[i].status != DIST_RAY_UNRESOLVED) continue;
+            CHECK(hits[i].error > 0 && hits[i].error < 2.001f && hits[i].distance >= 0);
+        }
+    }
+    CHECK(resolved * 1000 > RAYS * 995);
+    dist_context_destroy(ctx);
+}
+
 int main(int argc, char **argv)
 {
     test_begin(argc, argv);
@@ -1079,5 +1228,8 @@ int main(int argc, char **argv)
 #ifndef DIST_NO_BACKWARD
     RUN(pixels_not_asked_for_give_no_gradient);
 #endif
+    RUN(a_query_budget_is_kept_and_more_of_it_finds_more);
+    RUN(a_query_budget_gives_the_same_bits_for_every_number_of_workers);
+    RUN(a_query_budget_of_free_rays_is_kept);
     return test_report();
 }

@@ -38,6 +38,23 @@ static inline dist_net *load_net_or_skip(dist_context *ctx, const char *name)
     return load_model(ctx, path);
 }
 
+/* 2.2 radii away, azimuth 35, elevation 25 degrees, a focal length of 385 pixels at 512 (of the shorter side): then about
+   121,000 rays of 512 x 512 meet the bounding sphere, as in the paper's table of queries. */
+static inline dist_camera bench_camera(const dist_field *field, int width, int height)
+{
+    const float azimuth = 35.0f * PI / 180.0f;
+    const float elevation = 25.0f * PI / 180.0f;
+    const float up[3] = {0, 1, 0};
+    float r = 2.2f * field->radius;
+    float eye[3];
+    eye[0] = field->center[0] + r * cosf(elevation) * sinf(azimuth);
+    eye[1] = field->center[1] + r * sinf(elevation);
+    eye[2] = field->center[2] + r * cosf(elevation) * cosf(azimuth);
+    dist_camera camera = dist_camera_look_at(width, height, 1.0f, eye, field->center, up);
+    camera.fx = camera.fy = 385.0f * (float)(width < height ? width : height) / 512.0f;
+    return camera;
+}
+
 static inline int compare_doubles(const void *a, const void *b)
 {
     const double *x = (const double *)a;

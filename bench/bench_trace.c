@@ -63,21 +63,6 @@ static const float sphere_numbers[4] = {0, 0, 0, 0.8f};
 static const float torus_numbers[5] = {0, 0, 0, 0.62f, 0.24f};
 static const float box_numbers[6] = {0, 0, 0, 0.5f, 0.35f, 0.45f};
 
-static dist_camera camera_for(const dist_field *field, int size)
-{
-    const float azimuth = 35.0f * PI / 180.0f;
-    const float elevation = 25.0f * PI / 180.0f;
-    const float up[3] = {0, 1, 0};
-    float r = 2.2f * field->radius;
-    float eye[3];
-    eye[0] = field->center[0] + r * cosf(elevation) * sinf(azimuth);
-    eye[1] = field->center[1] + r * sinf(elevation);
-    eye[2] = field->center[2] + r * cosf(elevation) * cosf(azimuth);
-    dist_camera camera = dist_camera_look_at(size, size, 1.0f, eye, field->center, up);
-    camera.fx = camera.fy = 385.0f * (float)size / 512.0f;
-    return camera;
-}
-
 /* ---- reference --------------------------------------------------------------------------------------------------- */
 
 enum { REF_OUTSIDE = 0, REF_MISS, REF_HIT, REF_INSIDE };
@@ -271,7 +256,7 @@ static void print_result(const char *name, const method *m, int size, const resu
 /* All methods on one field. scaled: queries where the parallel row has the paper's 6.06 million. */
 static void ladder(dist_context *ctx, const char *name, const dist_field *field, int size, int steps)
 {
-    dist_camera camera = camera_for(field, size);
+    dist_camera camera = bench_camera(field, size, size);
     reference ref = reference_create(ctx, field, &camera);
     double parallel = 0;
     for (int m = 0; m < METHODS; m++) {
@@ -325,7 +310,7 @@ static void run_case(dist_context *ctx, const trace_case *c, int quick)
     dist_shape *shape = NULL;
     dist_field field = field_of(ctx, c->name, net, c->code, &shape);
     for (int size = 128; size <= (quick ? 128 : 512); size *= 2) {
-        dist_camera camera = camera_for(&field, size);
+        dist_camera camera = bench_camera(&field, size, size);
         reference ref = reference_create(ctx, &field, &camera);
         for (int m = FIRST_SHORT; m < METHODS; m++) {
             result r = trace_once(ctx, &field, &camera, &methods[m], 50, &ref);

@@ -1,0 +1,356 @@
+/* SPDX-License-Identifier: MIT-0
+   bench_step.c - what a whole step of an optimization costs: render (depth, silhouette, mask), losses, gradient for the
+   code, Adam; and what a frame costs that is only looked at. CSV on stdout.
+
+   ratio is the step's time divided by the time that 887,000 queries of the same net, not folded, would take at the
+   multiply-add peak measured in the same run with the same threads: the paper's step, had its arithmetic been done at
+   full speed. mode cold: every picture traced anew; frame: depth, normals and mask, no gradient.
+   bytes: most memory held beside the caller's planes and the weights. moved: mean change of depth of a step, in radii.
+   The camera is 2.2 radii away with a focal length of 385 pixels at 512, as in bench_trace. */
+#define DIST_IMPLEMENTATION
+#include "../dist.h"
+#include "../examples/common.h"
+#include "bench.h"
+#include "peak.h"
+
+static const char usage[] =
+    "bench_step [options]\n"
+    "  --case NAME        only this one\n"
+    "  --size N           pixels along a side of the steps (default 512)\n"
+    "  --steps N          measured steps of a fit (default 12)\n"
+    "  --rate R           Adam's (default 0.001)\n"
+    "  --threads N        threads (default all)\n"
+    "  --quick            128 pixels, few cases\n";
+
+typedef struct step_case {
+    const char *name, *net; /* net NULL: made here, layers x width, a sphere's distance */
+    int code, layers, width, quick;
+} step_case;
+
+static const step_case cases[] = {
+    {"deepsdf_512", "deepsdf_512", 0, 8, 512, 0},
+    {"embedded", "embedded", 5, 0, 0, 1},
+    {"bob_spot", "bob_spot", 1, 0, 0, 1},
+    {"spot_geometry", "spot_geometry", 0, 0, 0, 0},
+    {"round_cross", "round_cross", 10, 0, 0, 0},
+    {"primitives", "primitives", 13, 0, 0, 0},
+    {"mug_camera_bottle", "mug_camera_bottle", 0, 0, 0, 0},
+    {"chairs", "chairs", 3, 0, 0, 0},
+    {"deepsdf_512_he", "deepsdf_512_he", 0, 0, 0, 0},
+};
+
+enum { CASES = sizeof cases / sizeof cases[0], STEPS_MOST = 1000 };
+static const double PAPER_QUERIES = 887000;
+
+typedef struct settings {
+    const char *only;
+    int size, steps, threads, quick;
+    float rate;
+} settings;
+
+/* ---- memory ------------------------------------------------------------------------------------------------------ */
+
+typedef struct meter {
+    size_t held, most;
+} meter;
+
+static void *meter_alloc(void *user, size_t bytes, size_t alignment)
+{
+    meter *m = (meter *)user;
+    unsigned char *raw = (unsigned char *)malloc(bytes + alignment);
+    if (!raw) { return NULL; }
+    size_t shift = alignment - (size_t)raw % alignment; /* 1 to alignment: kept in the byte before */
+    raw[shift - 1] = (unsigned char)shift;
+    m->held += bytes;
+    m->most = m->held > m->most ? m->held : m->most;
+    return raw + shift;
+}
+
+static void meter_free(void *user, void *p, size_t bytes)
+{
+    unsigned char *q = (unsigned char *)p;
+    ((meter *)user)->held -= bytes;
+    free(q - q[-1]);
+}
+
+/* ---- the step ---------------------------------------------------------------------------------------------------- */
+
+static dist_net *made_net(dist_context *ctx, int layers, int width, int code_size, int skip)
+{
+    dist_net_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.layers = layers;
+    desc.width = width;
+    desc.code_size = code_size;
+    desc.code_count = code_size ? 1 : 0;
+    desc.skip = skip;
+    desc.geometric = 1;
+    desc.seed = 1;
+    dist_net *net = dist_net_create(ctx, &desc);
+    check(ctx);
+    return net;
+}
+
+/* The case's net: the file, or where it is absent one of the same size that is a sphere. NULL: left out. */
+static dist_net *net_of(dist_context *ctx, const step_case *c)
+{
+    dist_net *net = c->net ? load_net_or_skip(ctx, c->net) : NULL;
+    return net || !c->width ? net : made_net(ctx, c->layers, c->width, c->net ? 256 : 0, c->net ? 4 : 0);
+}
+
+typedef struct stepper {
+    dist_context *ctx;
+    dist_shape *shape;
+    dist_field field;
+    dist_camera camera;
+    dist_render_desc how;
+    dist_tape *tape;
+    dist_images out, d_out;
+    dist_stats stats;
+    dist_adam adam;
+    size_t n, code_size;
+    float *code, *d_code, *target, *before;
+    unsigned char *target_mask;
+} stepper;
+
+static stepper stepper_create(dist_context *ctx, const dist_net *net, int code, int size, float rate)
+{
+    stepper s;
+    memset(&s, 0, sizeof s);
+    s.ctx = ctx;
+    s.n = (size_t)size * (size_t)size;
+    s.code_size = (size_t)dist_net_code_size(net);
+    s.code = take_floats(s.code_size);
+    s.d_code = take_floats(s.code_size);
+    if (dist_net_code(net, code)) { memcpy(s.code, dist_net_code(net, code), s.code_size * sizeof(float)); }
+    s.shape = dist_shape_create(ctx, net, s.code);
+    s.field = dist_shape_field(s.shape);
+    s.camera = bench_camera(&s.field, size, size);
+    s.tape = dist_tape_create(ctx, &s.camera, &s.how);
+    check(ctx);
+    s.target = take_floats(s.n);
+    s.before = take_floats(s.n);
+    s.target_mask = (unsigned char *)take(s.n, 1);
+    s.out.depth = s.target;
+    s.out.mask = s.target_mask;
+    dist_render(ctx, &s.field, &s.camera, &s.how, &s.out, NULL); /* what is to be reached */
+    check(ctx);
+    s.out.depth = take_floats(s.n);
+    s.out.silhouette = take_floats(s.n);
+    s.out.mask = (unsigned char *)take(s.n, 1);
+    s.d_out.depth = take_floats(s.n);
+    s.d_out.silhouette = take_floats(s.n);
+    s.adam.rate = rate;
+    s.adam.moments = take_floats(2 * s.code_size);
+    rng r = rng_begin(1);
+    float size_of_code = 0; /* the fit starts a twentieth of the code's own size away */
+    for (size_t i = 0; i < s.code_size; i++) {
+        size_of_code += s.code[i] * s.code[i];
+    }
+    size_of_code = size_of_code > 0 ? sqrtf(size_of_code / (float)s.code_size) : 1.0f;
+    for (size_t i = 0; i < s.code_size; i++) {
+        s.code[i] += 0.05f * size_of_code * (2.0f * rng_uniform(&r) - 1.0f);
+    }
+    return s;
+}
+
+static void stepper_destroy(stepper *s)
+{
+    dist_tape_destroy(s->tape);
+    dist_shape_destroy(s->shape);
+    free(s->code);
+    free(s->d_code);
+    free(s->target);
+    free(s->before);
+    free(s->target_mask);
+    free(s->out.depth);
+    free(s->out.silhouette);
+    free(s->out.mask);
+    free(s->d_out.depth);
+    free(s->d_out.silhouette);
+    free(s->adam.moments);
+}
+
+/* One step; its seconds. */
+static double step_once(stepper *s)
+{
+    dist_gradients grads;
+    memset(&grads, 0, sizeof grads);
+    grads.code = s->d_code;
+    s->out.stats = s->d_out.stats = &s->stats;
+    double start = seconds_now();
+    memset(s->d_out.depth, 0, s->n * sizeof(float));
+    memset(s->d_out.silhouette, 0, s->n * sizeof(float));
+    memset(s->d_code, 0, s->code_size * sizeof(float));
+    dist_shape_set_code(s->shape, s->code);
+    dist_render(s->ctx, &s->field, &s->camera, &s->how, &s->out, s->tape);
+    dist_loss_depth(s->n, s->out.depth, s->target, s->out.mask, 10.0f, s->d_out.depth);
+    dist_loss_silhouette(s->n, s->out.silhouette, s->target_mask, 1.0f, s->d_out.silhouette);
+    dist_loss_code(s->code_size, s->code, 1.0f / (float)s->code_size, s->d_code);
+    dist_render_backward(s->ctx, s->tape, &s->d_out, &grads);
+    dist_adam_step(&s->adam, s->code_size, s->code, s->d_code);
+    check(s->ctx);
+    return seconds_now() - start;
+}
+
+/* Mean change of depth since the last picture, over the pixels that hit in both. */
+static double step_moved(stepper *s)
+{
+    double sum = 0;
+    double count = 0;
+    for (size_t i = 0; i < s->n; i++) {
+        if (s->before[i] > 0.0f && s->out.mask[i]) {
+            sum += fabs((double)s->before[i] - (double)s->out.depth[i]);
+            count += 1;
+        }
+        s->before[i] = s->out.mask[i] ? s->out.depth[i] : 0.0f;
+    }
+    return count > 0 ? sum / count / (double)s->field.radius : 0;
+}
+
+typedef struct row {
+    double seconds, queries, backward_points, peak, moved, hits;
+} row;
+
+/* The median of `steps` steps, after one that is not counted. */
+static row run_steps(stepper *s, int steps)
+{
+    static double seconds[STEPS_MOST], queries[STEPS_MOST], points[STEPS_MOST], moved[STEPS_MOST], peaks[STEPS_MOST];
+    double taken;
+    row r;
+    memset(&r, 0, sizeof r);
+    for (int i = -1; i < steps; i++) {
+        double once = step_once(s);
+        double change = step_moved(s);
+        if (i < 0) { continue; }
+        seconds[i] = once;
+        queries[i] = (double)s->stats.queries;
+        points[i] = (double)s->stats.backward_points;
+        moved[i] = change;
+        peaks[i] = peak_once(s->ctx, 8000000, &taken);
+    }
+    r.seconds = median((size_t)steps, seconds);
+    r.queries = median((size_t)steps, queries);
+    r.backward_points = median((size_t)steps, points);
+    r.moved = median((size_t)steps, moved);
+    r.peak = median((size_t)steps, peaks);
+    r.hits = (double)s->stats.hits;
+    return r;
+}
+
+static void print_row(const char *name, const char *mode, int width, int height, dist_context *ctx, double operations,
+                      const row *r, size_t bytes)
+{
+    double whole = PAPER_QUERIES * 2.0 * operations / (r->peak * 1e9);
+    char resolution[32];
+    snprintf(resolution, sizeof resolution, width == height ? "%d" : "%dx%d", width, height);
+    printf("%s,%s,%s,%d,%.5f,%.0f,%.0f,%.1f,%.4f,%.0f,%.0f,%.2f,%.1e\n", name, mode, resolution,
+           dist_context_workers(ctx), r->seconds, r->queries, r->backward_points, r->peak, r->seconds / whole,
+           (double)bytes, r->hits, r->hits > 0 ? r->queries / r->hits : 0, r->moved);
+    fflush(stdout);
+}
+
+static void run_case(dist_context *ctx, const step_case *c, const settings *set, meter *memory)
+{
+    size_t before = memory->held;
+    dist_net *net = net_of(ctx, c);
+    if (!net) { return; }
+    size_t weights = memory->held - before;
+    memory->most = memory->held;
+    stepper s = stepper_create(ctx, net, c->code, set->size, set->rate);
+    row r = run_steps(&s, set->steps);
+    print_row(c->name, "cold", set->size, set->size, ctx, (double)dist_net_operations(net, 0), &r,
+              memory->most - weights);
+    stepper_destroy(&s);
+    dist_net_destroy(net);
+}
+
+/* Frames of a game: a small net, depth, normals and mask, the camera on its way around. */
+static void run_frames(dist_context *ctx, const char *name, int layers, int width, int pixels_x, int pixels_y,
+                       meter *memory)
+{
+    enum { FRAMES = 24 };
+    double seconds[FRAMES];
+    double taken;
+    size_t n = (size_t)pixels_x * (size_t)pixels_y;
+    dist_net *net = made_net(ctx, layers, width, 0, 0);
+    memory->most = memory->held;
+    size_t before = memory->held;
+    dist_shape *shape = dist_shape_create(ctx, net, NULL);
+    dist_field field = dist_shape_field(shape);
+    dist_images out;
+    dist_stats stats;
+    row r;
+    memset(&out, 0, sizeof out);
+    memset(&r, 0, sizeof r);
+    out.depth = take_floats(n);
+    out.normal = take_floats(3 * n);
+    out.mask = (unsigned char *)take(n, 1);
+    out.stats = &stats;
+    for (int i = 0; i < FRAMES; i++) {
+        dist_camera camera = bench_camera(&field, pixels_x, pixels_y);
+        float turn[3] = {0, 0.05f * (float)i, 0};
+        dist_camera_move(&camera, turn, NULL);
+        camera.translation[0] = camera.translation[1] = 0; /* the center stays in the middle */
+        camera.translation[2] = 2.2f * field.radius;
+        double start = seconds_now();
+        dist_render(ctx, &field, &camera, NULL, &out, NULL);
+        check(ctx);
+        seconds[i] = seconds_now() - start;
+        r.hits = (double)stats.hits;
+        r.queries = (double)stats.queries;
+    }
+    r.seconds = median(FRAMES, seconds);
+    r.peak = peak_once(ctx, 8000000, &taken);
+    print_row(name, "frame", pixels_x, pixels_y, ctx, (double)dist_net_operations(net, 0), &r, memory->most - before);
+    fprintf(stderr, "%s: %.1f frames a second\n", name, 1.0 / r.seconds);
+    free(out.depth);
+    free(out.normal);
+    free(out.mask);
+    dist_shape_destroy(shape);
+    dist_net_destroy(net);
+}
+
+int main(int argc, char **argv)
+{
+    settings set = {NULL, 512, 12, 0, 0, 1e-3f};
+    options o = options_begin(argc, argv, usage);
+    while (option_next(&o)) {
+        if (option_is(&o, "--case")) {
+            set.only = option_text(&o);
+        } else if (option_is(&o, "--size")) {
+            set.size = option_int(&o, 8, 4096);
+        } else if (option_is(&o, "--steps")) {
+            set.steps = option_int(&o, 1, STEPS_MOST);
+        } else if (option_is(&o, "--rate")) {
+            set.rate = (float)option_number(&o, 1e-9, 1e3);
+        } else if (option_is(&o, "--threads")) {
+            set.threads = option_int(&o, 1, 1024);
+        } else if (option_is(&o, "--quick")) {
+            set.quick = option_flag(&o);
+            set.size = 128;
+            set.steps = 4;
+        } else {
+            option_unknown(&o);
+        }
+    }
+    meter memory = {0, 0};
+    dist_context_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.workers = set.threads;
+    desc.allocator.user = &memory;
+    desc.allocator.alloc_fn = meter_alloc;
+    desc.allocator.free_fn = meter_free;
+    dist_context *ctx = dist_context_create(&desc);
+    check(ctx);
+    puts("case,mode,resolution,threads,seconds,queries,backward_points,peak_gflops,ratio,bytes,hits,"
+         "queries_per_hit,moved");
+    for (int i = 0; i < CASES; i++) {
+        int wanted = set.only ? strcmp(set.only, cases[i].name) == 0 : !set.quick || cases[i].quick;
+        if (wanted) { run_case(ctx, &cases[i], &set, &memory); }
+    }
+    if (!set.only || strcmp(set.only, "game_4x64") == 0) { run_frames(ctx, "game_4x64", 4, 64, 512, 512, &memory); }
+    if (!set.only || strcmp(set.only, "game_2x32") == 0) { run_frames(ctx, "game_2x32", 2, 32, 640, 360, &memory); }
+    dist_context_destroy(ctx);
+    return 0;
+}

@@ -188,12 +188,21 @@ typedef struct dist_field {
                               float *d_weights);
     /* color (n, 3) at n points. NULL: this field has no color. */
     void (*color_fn)(void *user, int worker, size_t n, const float *points, float *color);
+    /* With L = sum_i d_color[i] . color(points[i]): adds dL/dpoint to d_points (n, 3), dL/dcode to d_code and
+       dL/d(color code) to d_color_code; each is NULL where it is not wanted. NULL: the color has no adjoint. */
+    void (*color_adjoint_fn)(void *user, int worker, size_t n, const float *points, const float *d_color,
+                             float *d_points, double *d_code, double *d_color_code);
+    /* Set by dist_shape_field: adds dL/dweights of the net that gives the color. */
+    void (*color_weights_fn)(void *user, dist_context *ctx, size_t n, const float *points, const float *d_color,
+                             float *d_weights);
     float center[3]; /* bounding sphere: the surface lies inside it, nothing is looked for outside */
     float radius;
     float lipschitz; /* bound or estimate of |grad f|; 0: 1 */
     float clamp;     /* |f| above this carries no distance (a clamped training); 0: none */
     int code_size;   /* length of d_code */
     size_t weight_count;
+    int color_code_size;       /* length of d_color_code */
+    size_t color_weight_count; /* of a color net of its own; 0: the weights of color, if any, are among weight_count */
     dist_context *owner; /* the context that made it; NULL: any */
 } dist_field;
 
@@ -208,6 +217,9 @@ DIST_API dist_field dist_field_box(const float center_half[6]);    /* x y z, hal
 DIST_API dist_status dist_field_eval(dist_context *ctx, const dist_field *field, size_t n,
                                      const float *points /* (n,3) */, float *sdf /* (n) */,
                                      float *gradient /* (n,3) or NULL */);
+/* Colors (n, 3) of a field that has them, at n points. */
+DIST_API dist_status dist_color_eval(dist_context *ctx, const dist_field *field, size_t n, const float *points,
+                                     float *color);
 
 #ifndef DIST_NO_BACKWARD
 /* Where gradients go; NULL is not wanted and costs nothing. All are added to.
@@ -220,15 +232,24 @@ typedef struct dist_gradients {
     float *weights;     /* (field.weight_count), the order of dist_net_weights */
     float *focal;       /* (2): dL/dfx, dL/dfy */
     float *principal;   /* (2): dL/dcx, dL/dcy */
+    float *color_code;    /* (field.color_code_size) */
+    float *color_weights; /* (field.color_weight_count), likewise of the texture */
 } dist_gradients;
 
 /* Adjoint of dist_field_eval: with L = sum_i d_sdf[i] f(points[i]), adds dL/dcode and dL/dweights to grads and
    d_sdf[i] * grad f(points[i]) to d_points (n, 3) unless NULL.
    d_sdf (n): the weights, in; with seed_fn it is filled from it instead: then value and adjoint cost one pass together.
-   The camera's members of grads must be NULL. */
+   What grads holds of camera and color must be NULL. */
 DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *field, size_t n, const float *points,
                                          float *d_sdf, dist_seed_fn seed_fn, void *seed_user, float *d_points,
                                          const dist_gradients *grads);
+
+/* Adjoint of dist_color_eval: with L = sum_i d_color[i] . color(points[i]), d_color (n, 3), adds dL/dpoint to d_points
+   (n, 3) unless NULL, and dL/dcode, dL/d(color code), dL/dweights of the net that gives the color to grads: its weights
+   are grads->color_weights where it is a texture, grads->weights where it is the shape's own net.
+   What grads holds of the camera must be NULL. */
+DIST_API dist_status dist_color_backward(dist_context *ctx, const dist_field *field, size_t n, const float *points,
+                                         const float *d_color, float *d_points, const dist_gradients *grads);
 #endif
 
 /* ---- 05 net ------------------------------------------------------------------------------------------------------ */
@@ -284,6 +305,7 @@ typedef struct dist_net_desc {
     int activation;   /* DIST_ACTIVATION_* */
     float scale;      /* beta of softplus, omega of sine; 0: 100, 30 */
     int output_linear;/* 0: tanh at the end, 1: nothing */
+    int color;        /* 1: a texture: r, g, b in place of the distance, with a sigmoid at the end unless linear */
     int geometric; /* 1: starts near the distance to a sphere of half the bound (ReLU, softplus); 0: PyTorch's start */
     float bound;      /* 0: 1 */
     float clamp;      /* 0: 0.1 with a code, none without */
@@ -300,6 +322,12 @@ DIST_API dist_status dist_net_set_code(dist_context *ctx, dist_net *net, int ind
 DIST_API dist_shape *dist_shape_create(dist_context *ctx, const dist_net *net, const float *code);
 DIST_API void dist_shape_destroy(dist_shape *shape);
 DIST_API dist_status dist_shape_set_code(dist_shape *shape, const float *code);
+/* Color by a second net: rgb = g(code, color code, point), where g's code is the shape's followed by the color's; so
+   dist_net_code_size(texture) is at least the shape's, and the rest is field.color_code_size. color_code is copied;
+   NULL means zeros. The net is borrowed until the shape is destroyed or gets another texture; texture NULL takes it
+   away. Fields taken before must be taken again. dist_shape_set_code sets the code of both nets. */
+DIST_API dist_status dist_shape_set_texture(dist_shape *shape, const dist_net *texture, const float *color_code);
+DIST_API dist_status dist_shape_set_color_code(dist_shape *shape, const float *color_code);
 /* The field of the net's distance channel. Borrows the shape. A net without one (r,g,b) gives a field that render
    refuses. */
 DIST_API dist_field dist_shape_field(dist_shape *shape);
@@ -391,7 +419,7 @@ typedef struct dist_stats {
     unsigned long long rays_in_sphere;  /* of them, those that meet the bounding sphere */
     unsigned long long queries;         /* points at which f was evaluated, everything included */
     unsigned long long cone_queries, march_queries, refine_queries, silhouette_queries,
-        normal_queries; /* their parts */
+        normal_queries, color_queries; /* their parts */
     unsigned long long hits, unresolved, inside, plateau, not_finite;
     unsigned long long capped;          /* backward: rays whose grad f . v was capped */
     unsigned long long backward_points; /* backward: points through the adjoint */
@@ -447,7 +475,8 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
                                  const dist_render_desc *desc, const dist_images *out, dist_tape *tape);
 
 #ifndef DIST_NO_BACKWARD
-/* Adjoint of the dist_render that filled the tape: reads d_out's depth, distance, normal, silhouette; adds to grads.
+/* Adjoint of the dist_render that filled the tape: reads d_out's depth, distance, normal, silhouette, color; adds to
+   grads.
    d_out->stats, if given, gets capped, backward_points and skipped added. No allocator call. */
 DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *tape, const dist_images *d_out,
                                           const dist_gradients *grads);
@@ -2283,7 +2312,92 @@ DIST_API dist_status dist_field_eval(dist_context *ctx, const dist_field *field,
     return DIST_OK;
 }
 
+/* Colors, or their adjoint where d_color is given. */
+typedef struct disti_color_job {
+    const dist_field *field;
+    disti_pieces pieces;
+    const float *points, *d_color;
+    float *color, *d_points;
+    double *slots; /* (pieces.count, code_size + color_code_size) */
+    int code, color_code; /* which of the two are wanted */
+} disti_color_job;
+
+static void disti_color_task(void *arg, int index, int worker)
+{
+    const disti_color_job *job = (const disti_color_job *)arg;
+    const dist_field *field = job->field;
+    size_t first = (size_t)index * job->pieces.size, size = (size_t)field->code_size + (size_t)field->color_code_size;
+    size_t n = DISTI_MIN(job->pieces.size, job->pieces.n - first);
+    const float *points = job->points + 3 * first;
+    if (job->color) {
+        field->color_fn(field->user, worker, n, points, job->color + 3 * first);
+        return;
+    }
+    double *d_code = job->slots + (size_t)index * size;
+    field->color_adjoint_fn(field->user, worker, n, points, job->d_color + 3 * first,
+                            job->d_points ? job->d_points + 3 * first : NULL, job->code ? d_code : NULL,
+                            job->color_code ? d_code + field->code_size : NULL);
+}
+
+/* What makes a field's color unusable; fields without a distance are welcome here. */
+static dist_status disti_color_check(dist_context *ctx, const dist_field *field, int adjoint, const char *function)
+{
+    if (!field) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field is NULL", function, 0, 0);
+    if (adjoint ? !field->color_adjoint_fn : !field->color_fn)
+        return disti_fail(ctx, DIST_UNSUPPORTED, adjoint ? "%s: the field's color has no adjoint"
+                                                         : "%s: the field has no color", function, 0, 0);
+    if (field->code_size < 0 || field->color_code_size < 0)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.code_size is %d, color_code_size %d, must not be negative",
+                          function, field->code_size, field->color_code_size);
+    if (field->owner && field->owner != ctx)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field belongs to another context", function, 0, 0);
+    return DIST_OK;
+}
+
+DIST_API dist_status dist_color_eval(dist_context *ctx, const dist_field *field, size_t n, const float *points,
+                                     float *color)
+{
+    disti_color_job job;
+    dist_status status = disti_enter(ctx, "dist_color_eval");
+    if (status == DIST_OK) status = disti_color_check(ctx, field, 0, "dist_color_eval");
+    if (status != DIST_OK || n == 0) return status;
+    if (!points || !color)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_color_eval: %s is NULL", points ? "color" : "points", 0, 0);
+    memset(&job, 0, sizeof job);
+    job.field = field;
+    job.pieces = disti_cut(n, 8 * DISTI_BLOCK, 1u << 20);
+    job.points = points;
+    job.color = color;
+    disti_run(ctx, job.pieces.count, disti_color_task, &job);
+    return DIST_OK;
+}
+
 #ifndef DIST_NO_BACKWARD
+/* dist_color_backward behind the door: totals in double, in slot order. ctx->partial is large enough. */
+static void disti_color_backward_all(dist_context *ctx, const dist_field *field, size_t n, const float *points,
+                                     const float *d_color, float *d_points, double *d_code, double *d_color_code)
+{
+    disti_color_job job;
+    size_t code = (size_t)field->code_size, size = code + (size_t)field->color_code_size;
+    if (n == 0 || (!d_points && !d_code && !d_color_code)) return;
+    job.field = field;
+    job.pieces = disti_cut(n, DISTI_BLOCK, DISTI_SLOTS);
+    job.points = points;
+    job.d_color = d_color;
+    job.color = NULL;
+    job.d_points = d_points;
+    job.slots = ctx->partial;
+    job.code = d_code != NULL;
+    job.color_code = d_color_code != NULL;
+    memset(ctx->partial, 0, (size_t)job.pieces.count * size * sizeof(double));
+    disti_run(ctx, job.pieces.count, disti_color_task, &job);
+    for (size_t slot = 0; slot < (size_t)job.pieces.count; slot++) {
+        const double *part = ctx->partial + slot * size;
+        for (size_t j = 0; d_code && j < code; j++) d_code[j] += part[j];
+        for (size_t j = code; d_color_code && j < size; j++) d_color_code[j - code] += part[j];
+    }
+}
+
 /* One slot's share of dist_field_backward; d_code holds the slot's own sums. */
 typedef struct disti_backward_job {
     const dist_field *field;
@@ -2372,6 +2486,12 @@ static dist_status disti_gradients_check(dist_context *ctx, const dist_field *fi
     if (grads->weights && !field->weights_fn)
         return disti_fail(ctx, DIST_UNSUPPORTED, "%s: grads.weights is given, but the field has no weights_fn",
                           function, 0, 0);
+    if (grads->color_code && (field->color_code_size <= 0 || !field->color_adjoint_fn))
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: grads.color_code is given, but the field has no color code",
+                          function, 0, 0);
+    if (grads->color_weights && (field->color_weight_count == 0 || !field->color_weights_fn))
+        return disti_fail(ctx, DIST_UNSUPPORTED, "%s: grads.color_weights is given, but the field has no texture",
+                          function, 0, 0);
     return DIST_OK;
 }
 
@@ -2379,6 +2499,47 @@ static dist_status disti_gradients_check(dist_context *ctx, const dist_field *fi
 static int disti_gradients_camera(const dist_gradients *grads)
 {
     return grads->rotation || grads->translation || grads->focal || grads->principal;
+}
+
+/* Where the weights of the color's net go: a texture's, or the shape's own. */
+static float *disti_color_weights(const dist_field *field, const dist_gradients *grads)
+{
+    if (!field->color_weights_fn) return NULL;
+    return field->color_weight_count > 0 ? grads->color_weights : grads->weights;
+}
+
+DIST_API dist_status dist_color_backward(dist_context *ctx, const dist_field *field, size_t n, const float *points,
+                                         const float *d_color, float *d_points, const dist_gradients *grads)
+{
+    const char *name = "dist_color_backward";
+    dist_gradients mine;
+    dist_status status = disti_enter(ctx, name);
+    if (status == DIST_OK) status = disti_color_check(ctx, field, 1, name);
+    if (status == DIST_OK && !grads) status = disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: grads is NULL", name, 0, 0);
+    if (status != DIST_OK) return status;
+    if (disti_gradients_camera(grads))
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: what grads holds of the camera must be NULL", name, 0, 0);
+    if (grads->weights && (field->color_weight_count > 0 || !field->color_weights_fn))
+        return disti_fail(ctx, DIST_UNSUPPORTED, "%s: grads.weights is given, but the color is not of the shape's net",
+                          name, 0, 0);
+    mine = *grads;
+    mine.weights = NULL; /* a texture by itself has weights, but no weights_fn: that is the distance's */
+    status = disti_gradients_check(ctx, field, &mine, name);
+    if (status != DIST_OK || n == 0) return status;
+    if (!points || !d_color)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: %s is NULL", points ? "d_color" : "points", 0, 0);
+    size_t code = (size_t)field->code_size, size = code + (size_t)field->color_code_size;
+    status = disti_partial_reserve(ctx, size + size / DISTI_SLOTS + 1);
+    if (status != DIST_OK) return status;
+    double *total = ctx->partial + (size_t)DISTI_SLOTS * size;
+    memset(total, 0, size * sizeof(double));
+    disti_color_backward_all(ctx, field, n, points, d_color, d_points, grads->code ? total : NULL,
+                             grads->color_code ? total + code : NULL);
+    if (disti_color_weights(field, grads))
+        field->color_weights_fn(field->user, ctx, n, points, d_color, disti_color_weights(field, grads));
+    for (size_t j = 0; grads->code && j < code; j++) grads->code[j] += (float)total[j];
+    for (size_t j = code; grads->color_code && j < size; j++) grads->color_code[j - code] += (float)total[j];
+    return DIST_OK;
 }
 
 DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *field, size_t n, const float *points,
@@ -2394,10 +2555,9 @@ DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *fi
     if (!d_sdf && (!seed_fn || grads->weights))
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: d_sdf is NULL, needed without seed_fn and for weights", name, 0,
                           0);
-    if (disti_gradients_camera(grads))
+    if (disti_gradients_camera(grads) || grads->color_code || grads->color_weights)
         return disti_fail(ctx, DIST_BAD_ARGUMENT,
-                          "%s: grads.rotation, translation, focal and principal must be NULL: no camera here", name, 0,
-                          0);
+                          "%s: what grads holds of camera and color must be NULL: there is none here", name, 0, 0);
     size_t size = (size_t)field->code_size;
     /* one more slot than the pieces use: the total */
     status = disti_partial_reserve(ctx, size + size / DISTI_SLOTS + 1);
@@ -3255,6 +3415,7 @@ struct dist_shape {
     float *code;
     float *bias; /* (layers, max_rows): each layer's bias with the code folded in */
     float lipschitz;
+    dist_shape *texture; /* the net that colors it, with [code, color code] folded in; NULL: none */
     float *store; /* activations and deltas of store_blocks blocks, for weight gradients */
     size_t store_block_size;
     int store_blocks;
@@ -3277,6 +3438,7 @@ typedef struct disti_block {
     int alive_count[DISTI_MAX_LAYERS];
     int alive_units[DISTI_MAX_LAYERS]; /* of them, units: those before the encoded point's rows */
     int columns;
+    int channel, channels; /* the output's channels that the reverse pass starts from: the distance, or r, g, b */
 } disti_block;
 
 /* Returns the bytes needed; base NULL: only that. Sizes are bounded by 32 layers of 8192 + 99 rows. */
@@ -3682,27 +3844,43 @@ static void disti_keep_delta(const dist_net *net, const disti_block *b, int l, c
     }
 }
 
-/* Reverse pass of one block from the seeds at the last layer's pre-activation: leaves the encoded point's gradient in
-   b->d_point and the deltas of the layers that see the code in b->fold_delta; store, unless NULL, gets all deltas. */
+/* delta of the last layer's input: sum over the channels of W_k^T seed_k, masked. */
+static void disti_output_backward(const dist_shape *shape, const disti_kernels *kernels, const disti_block *b,
+                                  const float *seed, float *delta)
+{
+    const dist_net *net = shape->net;
+    int last = net->layers - 1, rows = net->layer[last].prev + net->layer[last].point, count = b->alive_count[last];
+    size_t at = (size_t)last * (size_t)net->max_rows;
+    const int *alive = count < rows ? b->alive + at : NULL;
+    const uint64_t *mask = net->activation == DIST_ACTIVATION_RELU ? b->mask + at : NULL;
+    const float *w = net->panels + net->layer[last].panel + (size_t)b->channel * (size_t)rows;
+    kernels->outer(w, seed, alive, count, rows, b->columns, mask, delta);
+    for (int k = 1; k < b->channels; k++) {
+        float *more = b->delta[(last + 1) & 1];
+        kernels->outer(w + k * rows, seed + k * DISTI_BLOCK, alive, count, rows, b->columns, mask, more);
+        for (int i = 0; i < count; i++) {
+            size_t row = (size_t)(alive ? alive[i] : i) * DISTI_BLOCK;
+            for (size_t c = 0; c < (size_t)b->columns; c++) delta[row + c] += more[row + c];
+        }
+    }
+}
+
+/* Reverse pass of one block from the seeds (channels, B) at the last layer's pre-activation: leaves the encoded
+   point's gradient in b->d_point and the deltas of the layers that see the code in b->fold_delta; store, unless NULL,
+   gets all deltas. */
 static void disti_net_reverse(const dist_shape *shape, disti_block *b, const float *seed, float *store)
 {
     const dist_net *net = shape->net;
     disti_kernels kernels = disti_kernels_for(shape->ctx->isa);
     int last = net->layers - 1, fold = net->fold_count;
-    size_t width = (size_t)net->max_rows;
+    size_t width = (size_t)net->max_rows, seeds = (size_t)b->channels * DISTI_BLOCK * sizeof(float);
     const disti_linear *layer = &net->layer[last];
-    int rows = layer->prev + layer->point;
     memset(b->d_point, 0, (size_t)net->point_size * DISTI_BLOCK * sizeof(float));
     float *delta = b->delta[last & 1];
-    kernels.outer(net->panels + layer->panel + (size_t)net->sdf_channel * (size_t)rows, seed,
-                  b->alive_count[last] < rows ? b->alive + (size_t)last * width : NULL, b->alive_count[last], rows,
-                  b->columns, net->activation == DIST_ACTIVATION_RELU ? b->mask + (size_t)last * width : NULL, delta);
+    disti_output_backward(shape, &kernels, b, seed, delta);
     disti_add_point_rows(layer, delta, b->d_point);
-    if (store) memcpy(store + disti_store_offset(net, last, DISTI_STORE_DELTA), seed, DISTI_BLOCK * sizeof(float));
-    if (layer->code) {
-        fold--;
-        memcpy(b->fold_delta + (size_t)fold * width * DISTI_BLOCK, seed, DISTI_BLOCK * sizeof(float));
-    }
+    if (store) memcpy(store + disti_store_offset(net, last, DISTI_STORE_DELTA), seed, seeds);
+    if (layer->code) memcpy(b->fold_delta + (size_t)--fold * width * DISTI_BLOCK, seed, seeds);
     for (int l = last - 1; l >= 0; l--) {
         layer = &net->layer[l];
         disti_hidden_delta(net, b, l, delta, store ? store + disti_store_offset(net, l, DISTI_STORE_NORM) : NULL);
@@ -3720,25 +3898,28 @@ static void disti_block_begin(const dist_shape *shape, int worker, disti_block *
 {
     disti_block_layout(shape->net, disti_scratch(shape->ctx, worker) + DISTI_FIELD_OFFSET, b);
     b->columns = (int)n;
+    b->channel = shape->net->sdf_channel;
+    b->channels = 1;
     disti_encode(shape->net, n, points, b->point);
     disti_counter_of(shape->ctx, worker)->dense += (double)dist_net_operations(shape->net, 1) * (double)n;
 }
 
-/* d_code += sum over the layers that see the code of scale W_code^T S,  S[o] = sum over points of delta[o] */
-static void disti_fold_backward(const dist_net *net, const double *fold_sum, double *d_code)
+/* d_code += sum over the layers that see the code of scale W_code^T S,  S[o] = sum over points of delta[o], for `count`
+   numbers of the net's code from `first`. */
+static void disti_fold_backward(const dist_net *net, const disti_block *b, size_t first, size_t count, double *d_code)
 {
     size_t fold = 0;
     for (int l = 0; l < net->layers; l++) {
         const disti_linear *layer = &net->layer[l];
         if (!layer->code) continue;
-        const double *sum = fold_sum + fold++ * (size_t)net->max_rows;
-        size_t out = l + 1 == net->layers ? 1 : (size_t)layer->out;
-        size_t row = l + 1 == net->layers ? (size_t)net->sdf_channel : 0;
+        const double *sum = b->fold_sum + fold++ * (size_t)net->max_rows;
+        size_t out = (size_t)(l + 1 == net->layers ? b->channels : layer->out);
+        size_t row = l + 1 == net->layers ? (size_t)b->channel : 0;
         for (size_t o = 0; o < out; o++) {
             const float *w = net->params + layer->weight + (o + row) * (size_t)layer->in + layer->code_column;
             double s = sum[o] * (double)layer->scale;
             if (s == 0.0) continue;
-            for (size_t j = 0; j < (size_t)net->code_size; j++) d_code[j] += s * (double)w[j];
+            for (size_t j = 0; j < count; j++) d_code[j] += s * (double)w[first + j];
         }
     }
 }
@@ -3750,7 +3931,7 @@ static void disti_fold_sum(const dist_net *net, const disti_block *b, const floa
     for (int l = 0; l < net->layers; l++) {
         const disti_linear *layer = &net->layer[l];
         if (!layer->code) continue;
-        size_t out = l + 1 == net->layers ? 1 : (size_t)layer->out;
+        size_t out = (size_t)(l + 1 == net->layers ? b->channels : layer->out);
         const float *delta = b->fold_delta + fold * (size_t)net->max_rows * DISTI_BLOCK;
         double *sum = b->fold_sum + fold++ * (size_t)net->max_rows;
         for (size_t o = 0; o < out; o++) {
@@ -3787,7 +3968,7 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
         seed_fn(seed_user, at, count, value, g, seed);
         if (d_code) disti_fold_sum(net, &b, seed);
     }
-    if (d_code) disti_fold_backward(net, b.fold_sum, d_code);
+    if (d_code) disti_fold_backward(net, &b, 0, (size_t)net->code_size, d_code);
 }
 
 static void disti_shape_eval_fn(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
@@ -3811,11 +3992,60 @@ static void disti_shape_channels(const dist_shape *shape, int worker, size_t n, 
     }
 }
 
-static void disti_shape_color_fn(void *user, int worker, size_t n, const float *points, float *color)
+/* The shape whose net gives the color: the texture, or the shape itself. */
+static const dist_shape *disti_shape_paint(const void *user)
 {
     const dist_shape *shape = (const dist_shape *)user;
-    disti_shape_channels(shape, worker, n, points, shape->net->color_channel, 3, color);
+    return shape->texture ? shape->texture : shape;
 }
+
+static void disti_shape_color_fn(void *user, int worker, size_t n, const float *points, float *color)
+{
+    const dist_shape *paint = disti_shape_paint(user);
+    disti_shape_channels(paint, worker, n, points, paint->net->color_channel, 3, color);
+}
+
+#ifndef DIST_NO_BACKWARD
+/* Forward and reverse pass of one block from dL/d(r, g, b); leaves what disti_net_reverse does. */
+static void disti_color_reverse(const dist_shape *paint, int worker, disti_block *b, size_t n, const float *d_color,
+                                float *store)
+{
+    float *value = b->tail, *slope = b->tail + DISTI_BLOCK, *seed = b->tail + 2 * DISTI_BLOCK;
+    const float *x = disti_net_forward(paint, b, store, disti_counter_of(paint->ctx, worker));
+    b->channel = paint->net->color_channel;
+    b->channels = 3;
+    for (int k = 0; k < 3; k++) {
+        disti_net_output(paint, b, x, b->channel + k, value, slope);
+        for (size_t c = 0; c < DISTI_BLOCK; c++)
+            seed[k * DISTI_BLOCK + (int)c] = c < n ? d_color[3 * c + (size_t)k] * slope[c] : 0.0f;
+    }
+    disti_net_reverse(paint, b, seed, store);
+}
+
+/* dist_field.color_adjoint_fn of a net. A texture's code is the shape's, then the color's: so are their columns. */
+static void disti_shape_color_adjoint_fn(void *user, int worker, size_t n, const float *points, const float *d_color,
+                                         float *d_points, double *d_code, double *d_color_code)
+{
+    const dist_shape *paint = disti_shape_paint(user);
+    const dist_net *net = paint->net;
+    size_t own = (size_t)((const dist_shape *)user)->net->code_size;
+    disti_block b;
+    disti_block_layout(net, disti_scratch(paint->ctx, worker) + DISTI_FIELD_OFFSET, &b);
+    memset(b.fold_sum, 0, (size_t)net->fold_count * (size_t)net->max_rows * sizeof(double));
+    for (size_t at = 0; at < n; at += DISTI_BLOCK) {
+        size_t count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK);
+        disti_block_begin(paint, worker, &b, count, points + 3 * at);
+        disti_color_reverse(paint, worker, &b, count, d_color + 3 * at, NULL);
+        float *ones = b.tail, *g = b.tail + 8 * DISTI_BLOCK;
+        if (d_points) disti_encode_backward(net, b.point, b.d_point, g);
+        for (size_t i = 0; d_points && i < 3 * count; i++) d_points[3 * at + i] += g[i];
+        for (size_t c = 0; c < DISTI_BLOCK; c++) ones[c] = 1.0f;
+        if (d_code || d_color_code) disti_fold_sum(net, &b, ones);
+    }
+    if (d_code) disti_fold_backward(net, &b, 0, own, d_code);
+    if (d_color_code) disti_fold_backward(net, &b, own, (size_t)net->code_size - own, d_color_code);
+}
+#endif
 
 #ifndef DIST_NO_TRAIN
 /* Weight gradients go in two phases over a chunk of blocks, so that no partial sums are needed and the bits do not
@@ -3825,6 +4055,7 @@ typedef struct disti_weights_job {
     const dist_shape *shape;
     size_t n;
     const float *points;
+    const float *d_color; /* (n, 3): the channels are r, g, b; NULL: the distance, and what follows is about it */
     float *d_sdf;
     dist_seed_fn seed_fn;
     void *seed_user;
@@ -3845,6 +4076,10 @@ static void disti_weights_block(void *arg, int index, int worker)
     size_t count = DISTI_MIN(job->n - at, (size_t)DISTI_BLOCK);
     float *store = shape->store + (size_t)index * shape->store_block_size;
     disti_block_begin(shape, worker, &b, count, job->points + 3 * at);
+    if (job->d_color) {
+        disti_color_reverse(shape, worker, &b, count, job->d_color + 3 * at, store);
+        return;
+    }
     float *value = b.tail, *slope = b.tail + DISTI_BLOCK, *seed = b.tail + 2 * DISTI_BLOCK,
           *g = b.tail + 8 * DISTI_BLOCK;
     const float *x = disti_net_forward(shape, &b, store, disti_counter_of(shape->ctx, worker));
@@ -3862,13 +4097,20 @@ static void disti_weights_block(void *arg, int index, int worker)
         for (size_t c = 0; c < DISTI_BLOCK; c++) value[c] = 1.0f;
         memset(b.fold_sum, 0, (size_t)net->fold_count * (size_t)net->max_rows * sizeof(double));
         disti_fold_sum(net, &b, value);
-        disti_fold_backward(net, b.fold_sum, job->d_code + (size_t)index * (size_t)net->code_size);
+        disti_fold_backward(net, &b, 0, (size_t)net->code_size,
+                            job->d_code + (size_t)index * (size_t)net->code_size);
     }
 }
 
 enum { DISTI_WEIGHT_ROWS = 64 }; /* outputs of one task of the second phase */
 
-/* Adds one block's share to `count` rows of layer l from row `o`; the last layer's only row stands at sdf_channel. */
+/* The channels that a job is about: of the last layer's rows only theirs get a gradient. */
+static int disti_weights_channel(const disti_weights_job *job)
+{
+    return job->d_color ? job->shape->net->color_channel : job->shape->net->sdf_channel;
+}
+
+/* Adds one block's share to `count` rows of layer l from row `o`, counted from the job's channel in the last layer. */
 static void disti_weights_rows(const disti_weights_job *job, int l, size_t o, size_t count, int index)
 {
     const dist_shape *shape = job->shape;
@@ -3878,7 +4120,7 @@ static void disti_weights_rows(const disti_weights_job *job, int l, size_t o, si
     const float *store = shape->store + (size_t)index * shape->store_block_size;
     const float *xt = store + disti_store_offset(net, l, DISTI_STORE_INPUT);
     const float *delta = store + disti_store_offset(net, l, DISTI_STORE_DELTA) + o * DISTI_BLOCK;
-    size_t row = l + 1 == net->layers ? (size_t)net->sdf_channel : o;
+    size_t row = l + 1 == net->layers ? (size_t)disti_weights_channel(job) : o;
     size_t columns = DISTI_MIN(job->n - job->first - (size_t)index * DISTI_BLOCK, (size_t)DISTI_BLOCK);
     float *w = job->d_weights + layer->weight + row * (size_t)layer->in;
     disti_gemm_weights g;
@@ -3925,42 +4167,62 @@ static void disti_weights_task(void *arg, int index, int worker)
         if (o < rows) break;
         o -= rows;
     }
-    size_t out = l + 1 == net->layers ? 1 : (size_t)net->layer[l].out;
+    size_t out = l + 1 < net->layers ? (size_t)net->layer[l].out : job->d_color ? 3 : 1;
     size_t count = DISTI_MIN((size_t)DISTI_WEIGHT_ROWS, out - o);
     for (int i = 0; i < job->blocks; i++) disti_weights_rows(job, l, o, count, i);
 }
 
-/* dist_field.weights_fn of a net. ctx->partial holds at least store_blocks sums of code_size. */
+/* Both phases, chunk by chunk. ctx->partial holds at least store_blocks sums of code_size if d_code is wanted. */
+static void disti_weights_run(disti_weights_job *job, dist_context *ctx, double *d_code)
+{
+    const dist_shape *shape = job->shape;
+    const dist_net *net = shape->net;
+    size_t size = (size_t)net->code_size;
+    int tasks = 1;
+    for (int l = 0; l + 1 < net->layers; l++) tasks += (net->layer[l].out + DISTI_WEIGHT_ROWS - 1) / DISTI_WEIGHT_ROWS;
+    job->d_code = d_code ? ctx->partial : NULL;
+    for (; job->first < job->n; job->first += (size_t)shape->store_blocks * DISTI_BLOCK) {
+        size_t left = (job->n - job->first + DISTI_BLOCK - 1) / DISTI_BLOCK;
+        job->blocks = left < (size_t)shape->store_blocks ? (int)left : shape->store_blocks;
+        if (d_code) memset(ctx->partial, 0, (size_t)job->blocks * size * sizeof(double));
+        disti_run(ctx, job->blocks, disti_weights_block, job);
+        disti_run(ctx, tasks, disti_weights_task, job);
+        for (size_t i = 0; d_code && i < (size_t)job->blocks; i++)
+            for (size_t j = 0; j < size; j++) d_code[j] += ctx->partial[i * size + j];
+    }
+}
+
+/* dist_field.weights_fn of a net. */
 static dist_status disti_shape_weights_fn(void *user, dist_context *ctx, size_t n, const float *points, float *d_sdf,
                                           dist_seed_fn seed_fn, void *seed_user, float *d_points, double *d_code,
                                           float *d_weights)
 {
-    const dist_shape *shape = (const dist_shape *)user;
-    const dist_net *net = shape->net;
-    size_t size = (size_t)net->code_size;
     disti_weights_job job;
     memset(&job, 0, sizeof job);
-    job.shape = shape;
+    job.shape = (const dist_shape *)user;
     job.n = n;
     job.points = points;
     job.d_sdf = d_sdf;
     job.seed_fn = seed_fn;
     job.seed_user = seed_user;
     job.d_points = d_points;
-    job.d_code = d_code ? ctx->partial : NULL;
     job.d_weights = d_weights;
-    int tasks = 1;
-    for (int l = 0; l + 1 < net->layers; l++) tasks += (net->layer[l].out + DISTI_WEIGHT_ROWS - 1) / DISTI_WEIGHT_ROWS;
-    for (; job.first < n; job.first += (size_t)shape->store_blocks * DISTI_BLOCK) {
-        size_t left = (n - job.first + DISTI_BLOCK - 1) / DISTI_BLOCK;
-        job.blocks = left < (size_t)shape->store_blocks ? (int)left : shape->store_blocks;
-        if (d_code) memset(ctx->partial, 0, (size_t)job.blocks * size * sizeof(double));
-        disti_run(ctx, job.blocks, disti_weights_block, &job);
-        disti_run(ctx, tasks, disti_weights_task, &job);
-        for (size_t i = 0; d_code && i < (size_t)job.blocks; i++)
-            for (size_t j = 0; j < size; j++) d_code[j] += ctx->partial[i * size + j];
-    }
+    disti_weights_run(&job, ctx, d_code);
     return DIST_OK;
+}
+
+/* dist_field.color_weights_fn of a net. */
+static void disti_shape_color_weights_fn(void *user, dist_context *ctx, size_t n, const float *points,
+                                         const float *d_color, float *d_weights)
+{
+    disti_weights_job job;
+    memset(&job, 0, sizeof job);
+    job.shape = disti_shape_paint(user);
+    job.n = n;
+    job.points = points;
+    job.d_color = d_color;
+    job.d_weights = d_weights;
+    disti_weights_run(&job, ctx, NULL);
 }
 #endif
 
@@ -4015,10 +4277,22 @@ DIST_API dist_field dist_shape_field(dist_shape *shape)
         field.fused_fn = disti_shape_fused;
 #ifndef DIST_NO_TRAIN
         field.weights_fn = disti_shape_weights_fn;
-        field.weight_count = net->param_count;
 #endif
     }
-    if (net->color_channel >= 0) field.color_fn = disti_shape_color_fn;
+    if (shape->texture || net->color_channel >= 0) {
+        field.color_fn = disti_shape_color_fn;
+#ifndef DIST_NO_BACKWARD
+        field.color_adjoint_fn = disti_shape_color_adjoint_fn;
+#endif
+#ifndef DIST_NO_TRAIN
+        field.color_weights_fn = disti_shape_color_weights_fn;
+#endif
+    }
+#ifndef DIST_NO_TRAIN
+    field.weight_count = net->param_count;
+    if (shape->texture) field.color_weight_count = shape->texture->net->param_count;
+#endif
+    if (shape->texture) field.color_code_size = shape->texture->net->code_size - net->code_size;
     field.radius = net->bound;
     field.lipschitz = shape->lipschitz;
     field.clamp = net->clamp;
@@ -4027,17 +4301,9 @@ DIST_API dist_field dist_shape_field(dist_shape *shape)
 }
 
 /* Folding: bias'[o] = bias[o] + scale sum_j W_code[o][j] code[j], in double; exact but for one rounding. */
-DIST_API dist_status dist_shape_set_code(dist_shape *shape, const float *code)
+static void disti_shape_fold(dist_shape *shape)
 {
-    if (!shape) return DIST_BAD_ARGUMENT;
     const dist_net *net = shape->net;
-    size_t size = (size_t)net->code_size;
-    for (size_t j = 0; code && j < size; j++)
-        if (!disti_finite(code[j]))
-            return disti_fail(shape->ctx, DIST_NOT_FINITE, "dist_shape_set_code: code[%d] is %d, must be finite", NULL,
-                              (double)j, (double)code[j]);
-    if (code) memcpy(shape->code, code, size * sizeof(float));
-    else memset(shape->code, 0, size * sizeof(float));
     for (int l = 0; l < net->layers; l++) {
         const disti_linear *layer = &net->layer[l];
         float *bias = shape->bias + (size_t)l * (size_t)net->max_rows;
@@ -4049,7 +4315,43 @@ DIST_API dist_status dist_shape_set_code(dist_shape *shape, const float *code)
             bias[o] = (float)((double)net->params[layer->bias + o] + (double)layer->scale * sum);
         }
     }
+}
+
+/* Copies n numbers of a code, zeros for NULL; refuses what is not finite. */
+static dist_status disti_code_copy(dist_context *ctx, const char *function, size_t n, const float *code, float *to)
+{
+    for (size_t j = 0; code && j < n; j++)
+        if (!disti_finite(code[j]))
+            return disti_fail(ctx, DIST_NOT_FINITE, "%s: code[%d] is %d, must be finite", function, (double)j,
+                              (double)code[j]);
+    if (code) memcpy(to, code, n * sizeof(float));
+    else memset(to, 0, n * sizeof(float));
     return DIST_OK;
+}
+
+DIST_API dist_status dist_shape_set_code(dist_shape *shape, const float *code)
+{
+    if (!shape) return DIST_BAD_ARGUMENT;
+    size_t size = (size_t)shape->net->code_size;
+    dist_status status = disti_code_copy(shape->ctx, "dist_shape_set_code", size, code, shape->code);
+    if (status != DIST_OK) return status;
+    disti_shape_fold(shape);
+    if (!shape->texture) return DIST_OK;
+    memcpy(shape->texture->code, shape->code, size * sizeof(float));
+    disti_shape_fold(shape->texture);
+    return DIST_OK;
+}
+
+DIST_API dist_status dist_shape_set_color_code(dist_shape *shape, const float *color_code)
+{
+    const char *name = "dist_shape_set_color_code";
+    if (!shape) return DIST_BAD_ARGUMENT;
+    if (!shape->texture) return disti_fail(shape->ctx, DIST_BAD_ARGUMENT, "%s: the shape has no texture", name, 0, 0);
+    dist_shape *texture = shape->texture;
+    size_t own = (size_t)shape->net->code_size, size = (size_t)texture->net->code_size;
+    dist_status status = disti_code_copy(shape->ctx, name, size - own, color_code, texture->code + own);
+    if (status == DIST_OK) disti_shape_fold(texture);
+    return status;
 }
 
 DIST_API void dist_shape_destroy(dist_shape *shape)
@@ -4057,6 +4359,7 @@ DIST_API void dist_shape_destroy(dist_shape *shape)
     if (!shape) return;
     dist_context *ctx = shape->ctx;
     const dist_net *net = shape->net;
+    dist_shape_destroy(shape->texture);
     disti_free(ctx, shape->store, (size_t)shape->store_blocks * shape->store_block_size * sizeof(float));
     disti_free(ctx, shape->bias, (size_t)net->layers * (size_t)net->max_rows * sizeof(float));
     disti_free(ctx, shape->code, (size_t)net->code_size * sizeof(float));
@@ -4083,7 +4386,7 @@ DIST_API dist_shape *dist_shape_create(dist_context *ctx, const dist_net *net, c
     shape->bias = (float *)disti_alloc(ctx, (size_t)net->layers * (size_t)net->max_rows * sizeof(float));
     if (!shape->code || !shape->bias) goto fail;
 #ifndef DIST_NO_TRAIN
-    if (net->sdf_channel >= 0) {
+    if (net->sdf_channel >= 0 || net->color_channel >= 0) {
         size_t block = disti_store_offset(net, net->layers, DISTI_STORE_INPUT);
         size_t blocks = ((size_t)4 << 20) / (block * sizeof(float));
         shape->store_block_size = block;
@@ -4103,6 +4406,36 @@ DIST_API dist_shape *dist_shape_create(dist_context *ctx, const dist_net *net, c
 fail:
     dist_shape_destroy(shape);
     return NULL;
+}
+
+DIST_API dist_status dist_shape_set_texture(dist_shape *shape, const dist_net *texture, const float *color_code)
+{
+    const char *name = "dist_shape_set_texture";
+    if (!shape) return DIST_BAD_ARGUMENT;
+    dist_context *ctx = shape->ctx;
+    dist_shape *paint = NULL;
+    dist_status status = disti_enter(ctx, name);
+    if (status != DIST_OK) return status;
+    if (texture && texture->color_channel < 0)
+        return disti_fail(ctx, DIST_UNSUPPORTED, "%s: the net has no channels r,g,b", name, 0, 0);
+    if (texture && texture->code_size < shape->net->code_size)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: the texture's code has %d numbers, fewer than the shape's %d",
+                          name, texture->code_size, shape->net->code_size);
+    if (texture) {
+        size_t own = (size_t)shape->net->code_size, size = (size_t)texture->code_size;
+        paint = dist_shape_create(ctx, texture, NULL);
+        if (!paint) return ctx->status;
+        memcpy(paint->code, shape->code, own * sizeof(float));
+        status = disti_code_copy(ctx, name, size - own, color_code, paint->code + own);
+        disti_shape_fold(paint);
+    }
+    if (status != DIST_OK) {
+        dist_shape_destroy(paint);
+        return status;
+    }
+    dist_shape_destroy(shape->texture);
+    shape->texture = paint;
+    return DIST_OK;
 }
 
 typedef struct disti_channels_job {
@@ -4873,16 +5206,19 @@ DIST_API dist_net *dist_net_create(dist_context *ctx, const dist_net_desc *desc)
     if (d.width == 0) d.width = 512;
     if (d.scale == 0.0f) d.scale = d.activation == DIST_ACTIVATION_SINE ? 30.0f : 100.0f;
     if (d.bound == 0.0f) d.bound = 1.0f;
-    if (d.clamp == 0.0f && d.code_size > 0) d.clamp = 0.1f;
+    if (d.clamp == 0.0f && d.code_size > 0 && !d.color) d.clamp = 0.1f;
     if (disti_net_desc_check(ctx, &d) != DIST_OK) return NULL;
     dist_net *net = disti_net_new(ctx);
     if (!net) return NULL;
     memset(skip, 0, sizeof skip);
     skip[d.skip] = d.skip > 0;
     net->layers = d.layers + 1;
-    net->channels = 1;
-    net->sdf_channel = 0;
-    memcpy(net->channel_names[0], "sdf", 4);
+    net->channels = d.color ? 3 : 1;
+    if (d.color) net->color_channel = 0;
+    else net->sdf_channel = 0;
+    memcpy(net->channel_names[0], d.color ? "r" : "sdf", d.color ? 2 : 4);
+    memcpy(net->channel_names[1], "g", 2);
+    memcpy(net->channel_names[2], "b", 2);
     net->raw = 1;
     net->point_size = 3;
     net->code_size = d.code_size;
@@ -4890,12 +5226,12 @@ DIST_API dist_net *dist_net_create(dist_context *ctx, const dist_net_desc *desc)
     net->activation = d.activation;
     if (d.activation == DIST_ACTIVATION_SOFTPLUS || d.activation == DIST_ACTIVATION_SINE)
         net->first_scale = net->scale = d.scale;
-    net->output = d.output_linear ? DISTI_OUTPUT_NONE : DISTI_OUTPUT_TANH;
+    net->output = d.output_linear ? DISTI_OUTPUT_NONE : d.color ? DISTI_OUTPUT_SIGMOID : DISTI_OUTPUT_TANH;
     net->bound = d.bound;
     net->clamp = d.clamp;
     net->norm_epsilon = 1e-5f;
     for (int l = 0; l < net->layers; l++) {
-        net->layer[l].out = l + 1 == net->layers ? 1 : d.width;
+        net->layer[l].out = l + 1 == net->layers ? net->channels : d.width;
         net->layer[l].in = (l > 0 ? d.width : 0) + (l == 0 || skip[l] ? 3 + d.code_size : 0);
     }
     if (disti_net_arrange(ctx, net, "dist_net_create", skip, 1.0f) != DIST_OK) {
@@ -5857,6 +6193,7 @@ static void disti_stats_end(dist_context *ctx, const disti_tracer *tracer, dist_
         out->refine_queries += s->refine_queries;
         out->silhouette_queries += s->silhouette_queries;
         out->normal_queries += s->normal_queries;
+        out->color_queries += s->color_queries;
         out->hits += s->hits;
         out->unresolved += s->unresolved;
         out->inside += s->inside;
@@ -6560,7 +6897,8 @@ static void disti_paper_trace(const disti_tracer *tracer, int worker, const dist
 
 /*@ 08 render ------------------------------------------------------------------------------------------------------- */
 
-enum { DISTI_CHUNK = DISTI_SLOTS * 4 * DISTI_BLOCK }; /* points of the backward pass held at once */
+/* Points of the backward pass held at once, and pixels whose colors go back at once. */
+enum { DISTI_CHUNK = DISTI_SLOTS * 4 * DISTI_BLOCK, DISTI_RUN = DISTI_SLOTS * DISTI_BLOCK };
 
 /* One point of the backward pass. */
 typedef struct disti_entry {
@@ -6587,6 +6925,7 @@ struct dist_tape {
     disti_tracer tracer;
     disti_entry *entry;     /* DISTI_CHUNK */
     float *points, *d_sdf, *d_points; /* (DISTI_CHUNK, 3), 1, 3 */
+    float *hit, *d_color, *pull;      /* (DISTI_RUN, 3): colored hits, and dL/dcolor, dL/dpoint there */
     double *d_code;
 };
 
@@ -6607,7 +6946,7 @@ static size_t disti_tape_bytes(const dist_tape *tape, int part)
                               &bytes);
         break;
     case 3: bytes = DISTI_CHUNK * sizeof(disti_entry); break;
-    case 4: bytes = DISTI_CHUNK * 7 * sizeof(float); break;
+    case 4: bytes = (DISTI_CHUNK * 7 + DISTI_RUN * 9) * sizeof(float); break;
     }
     return good ? bytes : (size_t)-1;
 }
@@ -6653,6 +6992,9 @@ DIST_API dist_tape *dist_tape_create(dist_context *ctx, const dist_camera *camer
     }
     tape->d_sdf = tape->points + 3 * (size_t)DISTI_CHUNK;
     tape->d_points = tape->d_sdf + DISTI_CHUNK;
+    tape->hit = tape->d_points + 3 * (size_t)DISTI_CHUNK;
+    tape->d_color = tape->hit + 3 * (size_t)DISTI_RUN;
+    tape->pull = tape->d_color + 3 * (size_t)DISTI_RUN;
     return tape;
 }
 
@@ -6812,6 +7154,7 @@ static void disti_render_colors(const disti_render_job *job, int worker, const d
         if (count == 0) break;
         field->color_fn(field->user, worker, count, points, color);
         bench->stats->queries += count;
+        bench->stats->color_queries += count;
         for (size_t k = 0; k < count; k++) {
             size_t pixel = disti_tile_pixel(tile, bench->index[k]);
             memcpy(job->out->color + 3 * pixel, color + 3 * k, 3 * sizeof(float));
@@ -7097,6 +7440,9 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
               and, but in the paper's mode, of the hit's motion: y += H u, d_t += v . H u, from grad f at the same
               points.
 
+   color      c = g(p, z, color code) at the hit p = o + t v: y = (dg/dp)^T d_c, d_t += y . v; z, the color code and the
+              color's weights receive dg's own part.
+
    All of them end as seeds a on df and pulls y, which disti_add_pull brings to the camera; and a normal in camera space
    turns with it: d_rotation += n x d_n.                                                                       */
 typedef struct disti_render_backward_job {
@@ -7106,10 +7452,11 @@ typedef struct disti_render_backward_job {
     dist_context *ctx;
     disti_view view;
     double rotation[3], translation[3], focal[2], principal[2];
-    double *d_code;
+    double *d_code, *d_color_code;
     unsigned long long capped, points, skipped;
     size_t count;
-    int camera; /* its gradient is wanted */
+    size_t colored; /* of this run's colored hits, how many the pixels so far have taken */
+    int camera, geometry; /* a gradient of the camera, one that depends on where the hit is at all, is wanted */
 } disti_render_backward_job;
 
 /* Seeds once grad f is known: d_sdf = entry's own, and the implicit rule's. */
@@ -7264,9 +7611,24 @@ static float disti_backward_normal(disti_render_backward_job *job, const disti_r
     return disti_finite(motion) ? motion : 0.0f;
 }
 
-/* One pixel with an upstream gradient. */
+/* What dL/dpoint at the hit p = o + t v gives: the pull on the camera at this t; returns dL/dt. */
+static float disti_backward_hit(disti_render_backward_job *job, const disti_ray *ray, const float *p,
+                                const float *d_point)
+{
+    double point[3], y[3], d_distance = 0.0;
+    if (!disti_finite_all(3, d_point)) return 0.0f;
+    for (int i = 0; i < 3; i++) {
+        point[i] = (double)p[i];
+        y[i] = (double)d_point[i];
+        d_distance += y[i] * (double)ray->direction[i];
+    }
+    disti_add_pull(job, point, y, 0.0);
+    return (float)d_distance;
+}
+
+/* One pixel with an upstream gradient; d_point is dL/dpoint at its hit, or NULL. */
 static void disti_backward_pixel(disti_render_backward_job *job, size_t pixel, float d_depth, float d_distance,
-                                 float d_silhouette, const float *d_normal)
+                                 float d_silhouette, const float *d_normal, const float *d_point)
 {
     const dist_tape *tape = job->tape;
     const dist_field *field = &tape->field;
@@ -7293,6 +7655,7 @@ static void disti_backward_pixel(disti_render_backward_job *job, size_t pixel, f
         d_depth = 0.0f;
     }
     if (d_normal && (status & DISTI_TAPE_HIT)) d_distance += disti_backward_normal(job, &ray, p, d_normal);
+    if (d_point) d_distance += disti_backward_hit(job, &ray, p, d_point);
     if (tape->sample) {
         const float *samples = tape->sample + pixel * (size_t)tape->samples * 4;
         for (int k = 0; k < (paper ? tape->samples : 1); k++) {
@@ -7319,31 +7682,63 @@ static float disti_upstream(const float *plane, size_t at)
     return plane && disti_finite(plane[at]) ? plane[at] : 0.0f;
 }
 
+/* dL/dcolor of a pixel; 0: it has none. */
+static int disti_upstream_color(const disti_render_backward_job *job, size_t pixel, float d_color[3])
+{
+    if (!job->d_out->color || !(job->tape->status[pixel] & DISTI_TAPE_HIT)) return 0;
+    for (size_t k = 0; k < 3; k++) d_color[k] = disti_upstream(job->d_out->color, 3 * pixel + k);
+    return d_color[0] != 0.0f || d_color[1] != 0.0f || d_color[2] != 0.0f;
+}
+
+/* The colors of `count` pixels, at most DISTI_RUN, back to codes and weights, and to tape->pull for the hits of those
+   that have an upstream gradient, one after another. */
+static void disti_backward_colors(disti_render_backward_job *job, size_t first, size_t count)
+{
+    const dist_tape *tape = job->tape;
+    const dist_field *field = &tape->field;
+    float *weights = disti_color_weights(field, job->grads);
+    size_t n = 0;
+    for (size_t pixel = first; pixel < first + count; pixel++) {
+        disti_ray ray;
+        double local[3];
+        if (!disti_upstream_color(job, pixel, tape->d_color + 3 * n)) continue;
+        disti_pixel_ray(&job->view, field, (int)(pixel % (size_t)tape->width), (int)(pixel / (size_t)tape->width),
+                        local, &ray);
+        disti_ray_point(&ray, tape->s[pixel], tape->hit + 3 * n++);
+    }
+    memset(tape->pull, 0, 3 * n * sizeof(float));
+    disti_color_backward_all(job->ctx, field, n, tape->hit, tape->d_color, job->geometry ? tape->pull : NULL,
+                             job->grads->code ? job->d_code : NULL, job->d_color_code);
+    if (weights) field->color_weights_fn(field->user, job->ctx, n, tape->hit, tape->d_color, weights);
+    job->points += n;
+    job->colored = 0;
+}
+
 static void disti_backward_pixels(disti_render_backward_job *job)
 {
     const dist_tape *tape = job->tape;
     const dist_images *d_out = job->d_out;
-    for (int y = 0; y < tape->height; y++) {
-        for (int x = 0; x < tape->width; x++) {
-            size_t pixel = (size_t)y * (size_t)tape->width + (size_t)x;
-            int hit = tape->status[pixel] & DISTI_TAPE_HIT;
-            if (tape->status[pixel] == DIST_RAY_SKIPPED) {
-                job->skipped++;
-                continue;
-            }
-            float d_depth = hit ? disti_upstream(d_out->depth, pixel) : 0.0f;
-            float d_distance = hit ? disti_upstream(d_out->distance, pixel) : 0.0f;
-            float d_silhouette = disti_upstream(d_out->silhouette, pixel);
-            float d_normal[3] = {0.0f, 0.0f, 0.0f};
-            for (size_t k = 0; hit && d_out->normal && k < 3; k++)
-                d_normal[k] = disti_upstream(d_out->normal, 3 * pixel + k);
-            int normal = d_normal[0] != 0.0f || d_normal[1] != 0.0f || d_normal[2] != 0.0f;
-            if (d_depth == 0.0f && d_distance == 0.0f && d_silhouette == 0.0f && !normal) {
-                job->skipped++;
-                continue;
-            }
-            disti_backward_pixel(job, pixel, d_depth, d_distance, d_silhouette, normal ? d_normal : NULL);
+    size_t pixels = (size_t)tape->width * (size_t)tape->height;
+    for (size_t pixel = 0; pixel < pixels; pixel++) {
+        int hit = tape->status[pixel] & DISTI_TAPE_HIT;
+        float d_depth = hit ? disti_upstream(d_out->depth, pixel) : 0.0f;
+        float d_distance = hit ? disti_upstream(d_out->distance, pixel) : 0.0f;
+        int asked = tape->status[pixel] != DIST_RAY_SKIPPED;
+        float d_silhouette = asked ? disti_upstream(d_out->silhouette, pixel) : 0.0f;
+        float d_normal[3] = {0.0f, 0.0f, 0.0f}, d_color[3];
+        if (d_out->color && pixel % DISTI_RUN == 0)
+            disti_backward_colors(job, pixel, DISTI_MIN(pixels - pixel, (size_t)DISTI_RUN));
+        int colored = disti_upstream_color(job, pixel, d_color);
+        for (size_t k = 0; hit && d_out->normal && k < 3; k++)
+            d_normal[k] = disti_upstream(d_out->normal, 3 * pixel + k);
+        int normal = d_normal[0] != 0.0f || d_normal[1] != 0.0f || d_normal[2] != 0.0f;
+        if (d_depth == 0.0f && d_distance == 0.0f && d_silhouette == 0.0f && !normal && !colored) {
+            job->skipped++;
+            continue;
         }
+        const float *d_point = colored ? tape->pull + 3 * job->colored++ : NULL;
+        if (job->geometry)
+            disti_backward_pixel(job, pixel, d_depth, d_distance, d_silhouette, normal ? d_normal : NULL, d_point);
     }
     disti_backward_flush(job);
 }
@@ -7366,27 +7761,29 @@ DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *ta
     if (d_out->silhouette && !tape->has_silhouette && tape->trace != DIST_TRACE_PAPER)
         return disti_fail(ctx, DIST_BAD_ARGUMENT,
                           "%s: d_out.silhouette is given, but out.silhouette was NULL in dist_render", name, 0, 0);
-    if (d_out->color)
-        return disti_fail(ctx, DIST_UNSUPPORTED, "%s: d_out.color has no adjoint yet, must be NULL", name, 0, 0);
+    if (d_out->color) status = disti_color_check(ctx, &tape->field, 1, name);
+    if (status != DIST_OK) return status;
     memset(&job, 0, sizeof job);
-    size_t size = (size_t)tape->field.code_size;
+    size_t code = (size_t)tape->field.code_size, size = code + (size_t)tape->field.color_code_size;
     if (size + size / DISTI_SLOTS + 1 > ctx->partial_size)
-        return disti_fail(ctx, DIST_UNSUPPORTED, "%s: field.code_size is %d, at most %d here", name, (double)size,
-                          (double)ctx->partial_size - 40.0);
+        return disti_fail(ctx, DIST_UNSUPPORTED, "%s: the field's codes have %d numbers, at most %d here", name,
+                          (double)size, (double)ctx->partial_size - 40.0);
     job.tape = tape;
     job.d_out = d_out;
     job.grads = grads;
     job.ctx = ctx;
     job.camera = disti_gradients_camera(grads);
     disti_view_of(&tape->camera, &job.view);
-    if (grads->code) {
-        job.d_code = ctx->partial + (size_t)DISTI_SLOTS * size;
-        memset(job.d_code, 0, size * sizeof(double));
-    }
+    job.geometry = grads->code || grads->weights || job.camera;
+    double *total = ctx->partial + (size_t)DISTI_SLOTS * size;
+    memset(total, 0, size * sizeof(double));
+    if (grads->code) job.d_code = total;
+    if (grads->color_code) job.d_color_code = total + code;
     unsigned state = disti_float_state_enter(); /* the normals' share is evaluated outside disti_run */
-    if (grads->code || grads->weights || job.camera) disti_backward_pixels(&job);
+    if (job.geometry || grads->color_code || grads->color_weights) disti_backward_pixels(&job);
     disti_float_state_leave(state);
-    for (size_t j = 0; grads->code && j < size; j++) grads->code[j] += (float)job.d_code[j];
+    for (size_t j = 0; grads->code && j < code; j++) grads->code[j] += (float)total[j];
+    for (size_t j = code; grads->color_code && j < size; j++) grads->color_code[j - code] += (float)total[j];
     for (int i = 0; i < 3; i++) {
         if (grads->rotation) grads->rotation[i] += (float)job.rotation[i];
         if (grads->translation) grads->translation[i] += (float)job.translation[i];

@@ -548,6 +548,7 @@ static inline void add_stats(dist_stats *sum, const dist_stats *s)
     sum->refine_queries += s->refine_queries;
     sum->silhouette_queries += s->silhouette_queries;
     sum->normal_queries += s->normal_queries;
+    sum->color_queries += s->color_queries;
     sum->hits += s->hits;
     sum->unresolved += s->unresolved;
     sum->inside += s->inside;
@@ -574,6 +575,7 @@ static inline void json_stats(json *j, const char *key, const dist_stats *s)
     json_count(j, "refine_queries", s->refine_queries);
     json_count(j, "silhouette_queries", s->silhouette_queries);
     json_count(j, "normal_queries", s->normal_queries);
+    json_count(j, "color_queries", s->color_queries);
     json_count(j, "hits", s->hits);
     json_count(j, "unresolved", s->unresolved);
     json_count(j, "inside", s->inside);

@@ -282,7 +282,9 @@ TEST_UNUSED static void model_fit_ball(model *m, const double *code, double radi
             double factor = i == j ? 1.0 - 1.0 / a[j][j] : a[i][j] / a[j][j];
             for (int k = size; k >= j; k--) a[i][k] -= factor * a[j][k];
         }
-    for (int k = 0; k <= n; k++) m->params[m->offset[l] + (size_t)k] = model_round(MODEL_F32, a[k][size]);
+    int channel = m->sdf_channel >= 0 ? m->sdf_channel : 0;
+    for (int k = 0; k < n; k++) m->params[m->offset[l] + (size_t)(channel * n + k)] = model_round(MODEL_F32, a[k][size]);
+    m->params[m->offset[l] + (size_t)(m->out[l] * n + channel)] = model_round(MODEL_F32, a[n][size]);
 }
 
 /* ---- its file ---------------------------------------------------------------------------------------------------- */

@@ -173,7 +173,7 @@ TEST(what_the_file_says_of_code_channels_bound_and_clamp_is_what_the_net_tells)
         CHECK_NEAR(d->clamp > 0.0 ? d->clamp : d->code_size ? 0.1 : 0.0, c.field.clamp, 1e-7);
         CHECK_EQUAL(d->code_size, c.field.code_size);
         CHECK_EQUAL(c.m.count, dist_net_weight_count(c.net));
-        CHECK_EQUAL(c.m.sdf_channel >= 0 ? c.m.count : 0, c.field.weight_count);
+        CHECK_EQUAL(c.m.count, c.field.weight_count);
         CHECK((c.field.color_fn != NULL) == (d->channels && strstr(d->channels, "r,g,b") != NULL));
         CHECK((c.field.eval_fn != NULL) == (c.m.sdf_channel >= 0));
         for (int i = 0; i < d->code_count * d->code_size; i++)

@@ -186,6 +186,13 @@ typedef struct dist_field {
     dist_status (*weights_fn)(void *user, dist_context *ctx, size_t n, const float *points, float *d_sdf,
                               dist_seed_fn seed_fn, void *seed_user, float *d_points, double *d_code,
                               float *d_weights);
+    /* Second derivatives, of s_i = directions[i] . grad f(points[i]) with directions (n, 3) of any length:
+       d_points[i] += ds_i/dpoint = H(points[i]) directions[i], and d_code[j] += sum over i of ds_i/dcode[j] unless
+       NULL. NULL: differences of grad f are taken. The other is the same with the weights, set by dist_shape_field. */
+    void (*second_fn)(void *user, int worker, size_t n, const float *points, const float *directions, float *d_points,
+                      double *d_code);
+    dist_status (*second_weights_fn)(void *user, dist_context *ctx, size_t n, const float *points,
+                                     const float *directions, float *d_points, double *d_code, float *d_weights);
     /* color (n, 3) at n points. NULL: this field has no color. */
     void (*color_fn)(void *user, int worker, size_t n, const float *points, float *color);
     /* With L = sum_i d_color[i] . color(points[i]): adds dL/dpoint to d_points (n, 3), dL/dcode to d_code and
@@ -199,6 +206,7 @@ typedef struct dist_field {
     float radius;
     float lipschitz; /* bound or estimate of |grad f|; 0: 1 */
     float clamp;     /* |f| above this carries no distance (a clamped training); 0: none */
+    int kinks;       /* 1: grad f jumps (ReLU), which second_fn leaves out: a normal's gradient is by differences */
     int code_size;   /* length of d_code */
     size_t weight_count;
     int color_code_size;       /* length of d_color_code */
@@ -250,6 +258,13 @@ DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *fi
    What grads holds of the camera must be NULL. */
 DIST_API dist_status dist_color_backward(dist_context *ctx, const dist_field *field, size_t n, const float *points,
                                          const float *d_color, float *d_points, const dist_gradients *grads);
+
+/* What makes f a distance: *loss = weight * mean over the n points of (|grad f| - 1)^2, and its gradient is added to
+   grads->code and ->weights. loss and grads may be NULL; the camera's members of grads must be. Points whose gradient
+   is not finite add nothing. Exact where the field has second_fn (a ReLU's kinks have no share, as in automatic
+   differentiation), else by differences of 1e-3 of the radius. */
+DIST_API dist_status dist_field_eikonal(dist_context *ctx, const dist_field *field, size_t n, const float *points,
+                                        float weight, float *loss, const dist_gradients *grads);
 #endif
 
 /* ---- 05 net ------------------------------------------------------------------------------------------------------ */

@@ -260,8 +260,8 @@ DIST_API dist_status dist_color_backward(dist_context *ctx, const dist_field *fi
                                          const float *d_color, float *d_points, const dist_gradients *grads);
 
 /* What makes f a distance: *loss = weight * mean over the n points of (|grad f| - 1)^2, and its gradient is added to
-   grads->code and ->weights. loss and grads may be NULL; the camera's members of grads must be. Points whose gradient
-   is not finite add nothing. Exact where the field has second_fn (a ReLU's kinks have no share, as in automatic
+   grads->code and ->weights. loss and grads may be NULL; what grads holds of camera and color must be. Points whose
+   gradient is not finite add nothing. Exact where the field has second_fn (a ReLU's kinks have no share, as in automatic
    differentiation), else by differences of 1e-3 of the radius. */
 DIST_API dist_status dist_field_eikonal(dist_context *ctx, const dist_field *field, size_t n, const float *points,
                                         float weight, float *loss, const dist_gradients *grads);
@@ -2418,6 +2418,7 @@ typedef struct disti_backward_job {
     const dist_field *field;
     disti_pieces pieces;
     const float *points;
+    const float *directions; /* not NULL: second_fn's */
     float *d_sdf;
     dist_seed_fn seed_fn;
     void *seed_user;
@@ -2455,6 +2456,11 @@ static void disti_backward_task(void *arg, int index, int worker)
     size_t n = DISTI_MIN(job->pieces.size, job->pieces.n - piece.first);
     double *d_code = job->d_code ? job->d_code + (size_t)index * (size_t)field->code_size : NULL;
     const float *points = job->points + 3 * piece.first;
+    if (job->directions) {
+        field->second_fn(field->user, worker, n, points, job->directions + 3 * piece.first,
+                         job->d_points ? job->d_points + 3 * piece.first : NULL, d_code);
+        return;
+    }
     if (field->fused_fn) {
         field->fused_fn(field->user, worker, n, points, NULL, NULL, disti_backward_seed, &piece, d_code);
         return;
@@ -2468,27 +2474,81 @@ static void disti_backward_task(void *arg, int index, int worker)
     }
 }
 
-/* dist_field_backward behind the door: d_code in double, partial sums in slot order. ctx->partial is large enough. */
+/* Runs job over its n points: d_code in double, partial sums in slot order. ctx->partial is large enough. */
+static void disti_backward_run(dist_context *ctx, disti_backward_job *job, size_t n, double *d_code)
+{
+    size_t size = (size_t)job->field->code_size;
+    if (n == 0) return;
+    job->pieces = disti_cut(n, 4 * DISTI_BLOCK, DISTI_SLOTS);
+    job->d_code = d_code ? ctx->partial : NULL;
+    if (d_code) memset(ctx->partial, 0, (size_t)job->pieces.count * size * sizeof(double));
+    disti_run(ctx, job->pieces.count, disti_backward_task, job);
+    if (!d_code) return;
+    for (size_t slot = 0; slot < (size_t)job->pieces.count; slot++)
+        for (size_t j = 0; j < size; j++) d_code[j] += ctx->partial[slot * size + j];
+}
+
+/* dist_field_backward behind the door. */
 static void disti_field_backward_all(dist_context *ctx, const dist_field *field, size_t n, const float *points,
                                      float *d_sdf, dist_seed_fn seed_fn, void *seed_user, float *d_points,
                                      double *d_code)
 {
     disti_backward_job job;
-    size_t size = (size_t)field->code_size;
-    if (n == 0) return;
+    memset(&job, 0, sizeof job);
     job.field = field;
-    job.pieces = disti_cut(n, 4 * DISTI_BLOCK, DISTI_SLOTS);
     job.points = points;
     job.d_sdf = d_sdf;
     job.seed_fn = seed_fn;
     job.seed_user = seed_user;
     job.d_points = d_points;
-    job.d_code = d_code ? ctx->partial : NULL;
-    if (d_code) memset(ctx->partial, 0, (size_t)job.pieces.count * size * sizeof(double));
-    disti_run(ctx, job.pieces.count, disti_backward_task, &job);
-    if (!d_code) return;
-    for (size_t slot = 0; slot < (size_t)job.pieces.count; slot++)
-        for (size_t j = 0; j < size; j++) d_code[j] += ctx->partial[slot * size + j];
+    disti_backward_run(ctx, &job, n, d_code);
+}
+
+enum { DISTI_CHUNK = DISTI_SLOTS * 4 * DISTI_BLOCK }; /* points of a backward pass held at once */
+
+/* Between traces the tracer's part of the first worker's scratch is free: room for 21 floats a point of a chunk. */
+static float *disti_chunk_scratch(const dist_context *ctx)
+{
+    return (float *)(void *)(disti_scratch(ctx, 0) + DISTI_COUNTER_BYTES);
+}
+
+/* Adjoint of s_i = u_i . grad f(p_i), u the directions: adds H u to d_points, ds/dcode and ds/dweights; each may be
+   NULL. At most DISTI_CHUNK points. delta 0: exact, by the field's callbacks. Else by differences over h = delta,
+       s = |u| (f(p + h u^) - f(p - h u^)) / (2 h),    u^ = u / |u|:    two points with the seeds +-|u| / (2 h). */
+static dist_status disti_field_second(dist_context *ctx, const dist_field *field, size_t n, const float *points,
+                                      const float *directions, float delta, float *d_points, double *d_code,
+                                      float *d_weights)
+{
+    dist_status status = DIST_OK;
+    if (!(delta > 0.0f) && d_weights)
+        return field->second_weights_fn(field->user, ctx, n, points, directions, d_points, d_code, d_weights);
+    if (!(delta > 0.0f)) {
+        disti_backward_job job;
+        memset(&job, 0, sizeof job);
+        job.field = field;
+        job.points = points;
+        job.directions = directions;
+        job.d_points = d_points;
+        disti_backward_run(ctx, &job, n, d_code);
+        return status;
+    }
+    float *moved = disti_chunk_scratch(ctx), *seeds = moved + 6 * n, *pulls = d_points ? seeds + 2 * n : NULL;
+    for (size_t i = 0; i < n; i++) {
+        const float *u = directions + 3 * i;
+        float length = disti_length(u[0], u[1], u[2]), step = length > 0.0f ? delta / length : 0.0f;
+        for (size_t k = 0; k < 3; k++) {
+            moved[6 * i + k] = points[3 * i + k] + step * u[k];
+            moved[6 * i + 3 + k] = points[3 * i + k] - step * u[k];
+        }
+        seeds[2 * i] = length / (2.0f * delta);
+        seeds[2 * i + 1] = -seeds[2 * i];
+    }
+    if (pulls) memset(pulls, 0, 6 * n * sizeof(float));
+    if (d_weights)
+        status = field->weights_fn(field->user, ctx, 2 * n, moved, seeds, NULL, NULL, pulls, d_code, d_weights);
+    else disti_field_backward_all(ctx, field, 2 * n, moved, seeds, NULL, NULL, pulls, d_code);
+    for (size_t i = 0; pulls && i < 3 * n; i++) d_points[i] += pulls[i / 3 * 6 + i % 3] + pulls[i / 3 * 6 + 3 + i % 3];
+    return status;
 }
 
 static dist_status disti_gradients_check(dist_context *ctx, const dist_field *field, const dist_gradients *grads,
@@ -2557,6 +2617,22 @@ DIST_API dist_status dist_color_backward(dist_context *ctx, const dist_field *fi
     return DIST_OK;
 }
 
+/* Sums for the code are kept in double until they are added: in one more slot than the pieces use. NULL: not wanted. */
+static dist_status disti_code_begin(dist_context *ctx, const dist_field *field, const dist_gradients *grads,
+                                    double **d_code)
+{
+    size_t size = (size_t)field->code_size;
+    dist_status status = disti_partial_reserve(ctx, size + size / DISTI_SLOTS + 1);
+    *d_code = status == DIST_OK && grads->code ? ctx->partial + (size_t)DISTI_SLOTS * size : NULL;
+    if (*d_code) memset(*d_code, 0, size * sizeof(double));
+    return status;
+}
+
+static void disti_code_end(const dist_field *field, const dist_gradients *grads, const double *d_code)
+{
+    for (size_t j = 0; d_code && j < (size_t)field->code_size; j++) grads->code[j] += (float)d_code[j];
+}
+
 DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *field, size_t n, const float *points,
                                          float *d_sdf, dist_seed_fn seed_fn, void *seed_user, float *d_points,
                                          const dist_gradients *grads)
@@ -2573,22 +2649,57 @@ DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *fi
     if (disti_gradients_camera(grads) || grads->color_code || grads->color_weights)
         return disti_fail(ctx, DIST_BAD_ARGUMENT,
                           "%s: what grads holds of camera and color must be NULL: there is none here", name, 0, 0);
-    size_t size = (size_t)field->code_size;
-    /* one more slot than the pieces use: the total */
-    status = disti_partial_reserve(ctx, size + size / DISTI_SLOTS + 1);
+    double *d_code;
+    status = disti_code_begin(ctx, field, grads, &d_code);
     if (status != DIST_OK) return status;
-    double *d_code = NULL;
-    if (grads->code) {
-        d_code = ctx->partial + (size_t)DISTI_SLOTS * size;
-        memset(d_code, 0, size * sizeof(double));
-    }
     if (grads->weights)
         status = field->weights_fn(field->user, ctx, n, points, d_sdf, seed_fn, seed_user, d_points, d_code,
                                    grads->weights);
     else
         disti_field_backward_all(ctx, field, n, points, d_sdf, seed_fn, seed_user, d_points, d_code);
-    if (status == DIST_OK && d_code)
-        for (size_t j = 0; j < size; j++) grads->code[j] += (float)d_code[j];
+    if (status == DIST_OK) disti_code_end(field, grads, d_code);
+    return status;
+}
+
+/* forward   L = w / n sum_i (|g_i| - 1)^2,  g = grad f
+   backward  dL/dg_i = u_i = 2 w / n (1 - 1 / |g_i|) g_i, and on from there as the adjoint of u_i . grad f(p_i), u held */
+DIST_API dist_status dist_field_eikonal(dist_context *ctx, const dist_field *field, size_t n, const float *points,
+                                        float weight, float *loss, const dist_gradients *grads)
+{
+    const char *name = "dist_field_eikonal";
+    double *d_code = NULL, sum = 0.0;
+    dist_status status = disti_enter(ctx, name);
+    if (loss) *loss = 0.0f;
+    if (status == DIST_OK) status = disti_field_check(ctx, field, name);
+    if (status == DIST_OK && grads) status = disti_gradients_check(ctx, field, grads, name);
+    if (status != DIST_OK || n == 0) return status;
+    if (!points) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: points is NULL", name, 0, 0);
+    if (!disti_finite(weight))
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: weight is %d, must be finite", name, (double)weight, 0);
+    if (grads && (disti_gradients_camera(grads) || grads->color_code || grads->color_weights))
+        return disti_fail(ctx, DIST_BAD_ARGUMENT,
+                          "%s: what grads holds of camera and color must be NULL: there is none here", name, 0, 0);
+    if (grads && !grads->code && !grads->weights) grads = NULL;
+    if (grads) status = disti_code_begin(ctx, field, grads, &d_code);
+    int exact = field->second_fn && (!grads || !grads->weights || field->second_weights_fn);
+    float *gradient = disti_chunk_scratch(ctx) + 14 * (size_t)DISTI_CHUNK, *sdf = gradient + 3 * (size_t)DISTI_CHUNK;
+    for (size_t at = 0; at < n && status == DIST_OK; at += DISTI_CHUNK) {
+        size_t count = DISTI_MIN(n - at, (size_t)DISTI_CHUNK);
+        disti_field_eval_all(ctx, field, count, points + 3 * at, sdf, gradient);
+        for (size_t i = 0; i < count; i++) {
+            float *g = gradient + 3 * i, length = disti_length(g[0], g[1], g[2]), factor = 0.0f;
+            if (disti_finite(length)) {
+                sum += ((double)length - 1.0) * ((double)length - 1.0);
+                if (length > 1e-12f) factor = 2.0f * weight * (1.0f - 1.0f / length) / (float)n;
+            }
+            for (int k = 0; k < 3; k++) g[k] = factor == 0.0f ? 0.0f : factor * g[k];
+        }
+        if (grads)
+            status = disti_field_second(ctx, field, count, points + 3 * at, gradient,
+                                        exact ? 0.0f : 1e-3f * field->radius, NULL, d_code, grads->weights);
+    }
+    if (status == DIST_OK && loss) *loss = (float)((double)weight * sum / (double)n);
+    if (status == DIST_OK && grads) disti_code_end(field, grads, d_code);
     return status;
 }
 #endif
@@ -3428,7 +3539,7 @@ struct dist_shape {
     dist_context *ctx;
     const dist_net *net;
     float *code;
-    float *bias; /* (layers, max_rows): each layer's bias with the code folded in */
+    float *bias; /* (layers + 1, max_rows): each layer's bias with the code folded in; then zeros, for tangents */
     float lipschitz;
     dist_shape *texture; /* the net that colors it, with [code, color code] folded in; NULL: none */
     float *store; /* activations and deltas of store_blocks blocks, for weight gradients */
@@ -3449,11 +3560,12 @@ typedef struct disti_block {
     float *hat;        /* (layers, max_rows, B): LayerNorm's normalized values */
     float *inverse;    /* (layers, B): and its 1 / sigma */
     double *fold_sum;  /* (fold_count, max_rows) */
-    float *tail;       /* (8, B): sdf, slope of the output, seed, scratch; (3 B): gradient */
+    float *tail;       /* (8, B): sdf, slope and curvature of the output, seed; (3 B): gradient */
     int alive_count[DISTI_MAX_LAYERS];
     int alive_units[DISTI_MAX_LAYERS]; /* of them, units: those before the encoded point's rows */
     int columns;
     int channel, channels; /* the output's channels that the reverse pass starts from: the distance, or r, g, b */
+    int half; /* 0; or B / 2: lane c + half is the tangent of lane c, see disti_second_block */
 } disti_block;
 
 /* Returns the bytes needed; base NULL: only that. Sizes are bounded by 32 layers of 8192 + 99 rows. */
@@ -3538,10 +3650,13 @@ static void disti_encode(const dist_net *net, size_t n, const float *points, flo
     }
 }
 
-/* backward  d_p = d_raw + sum_k b 2^k (cos(b 2^k p) d_sin_k - sin(b 2^k p) d_cos_k) */
-static void disti_encode_backward(const dist_net *net, const float *rows, const float *d_rows, float *d_points)
+/* backward  d_p = d_raw + sum_k b 2^k (cos(b 2^k p) d_sin_k - sin(b 2^k p) d_cos_k)
+   The tangents' rows sin' = b 2^k cos u, cos' = -b 2^k sin u have the same adjoint in terms of themselves. */
+static void disti_encode_backward(const dist_net *net, const disti_block *b, float *d_points)
 {
-    for (size_t c = 0; c < DISTI_BLOCK; c++) {
+    const float *rows = b->point, *d_rows = b->d_point;
+    size_t half = (size_t)b->half;
+    for (size_t c = 0; c < (half ? half : DISTI_BLOCK); c++) {
         for (int axis = 0; axis < 3; axis++) {
             float sum = net->raw ? d_rows[(size_t)axis * DISTI_BLOCK + c] : 0.0f;
             float factor = (float)net->base;
@@ -3549,6 +3664,7 @@ static void disti_encode_backward(const dist_net *net, const float *rows, const 
                 size_t s = (size_t)disti_encoding_row(net, k, axis, 0) * DISTI_BLOCK + c;
                 size_t co = (size_t)disti_encoding_row(net, k, axis, 1) * DISTI_BLOCK + c;
                 sum += factor * (rows[co] * d_rows[s] - rows[s] * d_rows[co]);
+                if (half) sum += factor * (rows[co + half] * d_rows[s + half] - rows[s + half] * d_rows[co + half]);
                 factor *= 2.0f;
             }
             d_points[3 * c + (size_t)axis] = sum;
@@ -3556,54 +3672,79 @@ static void disti_encode_backward(const dist_net *net, const float *rows, const 
     }
 }
 
-/* forward   mu = mean_u x, v = mean_u (x - mu)^2, hat = (x - mu) / sqrt(v + eps), y = gamma hat + beta, for each
-   lane */
-static void disti_norm(int units, float epsilon, const float *gamma, const float *beta, float *DISTI_RESTRICT x,
-                       float *DISTI_RESTRICT hat, float *DISTI_RESTRICT inverse)
+/* d <- P d / sigma,  P d = d - mean_u d - hat mean_u (d hat), for `lanes` lanes; along gets mean_u (d hat). P is
+   symmetric: a tangent goes forward through it as a gradient goes back. */
+static void disti_norm_project(int units, size_t lanes, const float *DISTI_RESTRICT hat,
+                               const float *DISTI_RESTRICT inverse, float *DISTI_RESTRICT d,
+                               float *DISTI_RESTRICT along)
+{
+    float mean[DISTI_BLOCK], share = 1.0f / (float)units;
+    size_t count = (size_t)units * DISTI_BLOCK;
+    for (size_t c = 0; c < lanes; c++) mean[c] = along[c] = 0.0f;
+    for (size_t u = 0; u < count; u += DISTI_BLOCK) {
+        for (size_t c = 0; c < lanes; c++) {
+            mean[c] += share * d[u + c];
+            along[c] += share * d[u + c] * hat[u + c];
+        }
+    }
+    for (size_t u = 0; u < count; u += DISTI_BLOCK)
+        for (size_t c = 0; c < lanes; c++) d[u + c] = (d[u + c] - mean[c] - hat[u + c] * along[c]) * inverse[c];
+}
+
+/* forward   mu = mean_u x, v = mean_u (x - mu)^2, sigma = sqrt(v + eps), hat = (x - mu) / sigma, y = gamma hat + beta,
+             for each lane; inverse gets 1 / sigma
+   tangents  hat' = P x' / sigma,  y' = gamma hat'; the inverse's place gets mean_u (hat x') */
+static void disti_norm(int units, float epsilon, const float *gamma, const float *beta, size_t half,
+                       float *DISTI_RESTRICT x, float *DISTI_RESTRICT hat, float *DISTI_RESTRICT inverse)
 {
     float mean[DISTI_BLOCK], variance[DISTI_BLOCK];
-    size_t count = (size_t)units;
-    for (size_t c = 0; c < DISTI_BLOCK; c++) mean[c] = variance[c] = 0.0f;
+    size_t count = (size_t)units, lanes = half ? half : DISTI_BLOCK;
+    for (size_t c = 0; c < lanes; c++) mean[c] = variance[c] = 0.0f;
     for (size_t u = 0; u < count; u++)
-        for (size_t c = 0; c < DISTI_BLOCK; c++) mean[c] += x[u * DISTI_BLOCK + c];
-    for (size_t c = 0; c < DISTI_BLOCK; c++) mean[c] /= (float)units;
+        for (size_t c = 0; c < lanes; c++) mean[c] += x[u * DISTI_BLOCK + c];
+    for (size_t c = 0; c < lanes; c++) mean[c] /= (float)units;
     for (size_t u = 0; u < count; u++) {
-        for (size_t c = 0; c < DISTI_BLOCK; c++) {
+        for (size_t c = 0; c < lanes; c++) {
             float d = x[u * DISTI_BLOCK + c] - mean[c];
             hat[u * DISTI_BLOCK + c] = d;
             variance[c] += d * d;
         }
     }
-    for (size_t c = 0; c < DISTI_BLOCK; c++) inverse[c] = 1.0f / sqrtf(variance[c] / (float)units + epsilon);
+    for (size_t c = 0; c < lanes; c++) inverse[c] = 1.0f / sqrtf(variance[c] / (float)units + epsilon);
     for (size_t u = 0; u < count; u++) {
-        for (size_t c = 0; c < DISTI_BLOCK; c++) {
+        for (size_t c = 0; c < lanes; c++) {
             float h = hat[u * DISTI_BLOCK + c] * inverse[c];
             hat[u * DISTI_BLOCK + c] = h;
             x[u * DISTI_BLOCK + c] = gamma[u] * h + beta[u];
         }
     }
+    if (!half) return;
+    disti_norm_project(units, half, hat, inverse, x + half, inverse + half);
+    for (size_t u = 0; u < count; u++) {
+        memcpy(hat + u * DISTI_BLOCK + half, x + u * DISTI_BLOCK + half, half * sizeof(float));
+        for (size_t c = half; c < 2 * half; c++) x[u * DISTI_BLOCK + c] *= gamma[u];
+    }
 }
 
-/* backward  g = gamma d_y,  d_x = (g - mean_u g - hat mean_u (g hat)) / sqrt(v + eps)     in place: d is d_y, then
-   d_x */
-static void disti_norm_backward(int units, const float *gamma, const float *DISTI_RESTRICT hat,
+/* backward  d_x = P gamma d_y / sigma     in place: d is d_y, then d_x
+   tangents  d_x' = P gamma d_y' / sigma, and from hat' to x, with g' = gamma d_y':
+             d_x -= (hat mean_u (g' hat') + hat' mean_u (g' hat) + d_x' mean_u (hat x')) / sigma */
+static void disti_norm_backward(int units, const float *gamma, size_t half, const float *DISTI_RESTRICT hat,
                                 const float *DISTI_RESTRICT inverse, float *DISTI_RESTRICT d)
 {
-    float mean[DISTI_BLOCK], along[DISTI_BLOCK];
-    size_t count = (size_t)units;
-    for (size_t c = 0; c < DISTI_BLOCK; c++) mean[c] = along[c] = 0.0f;
-    for (size_t u = 0; u < count; u++) {
-        for (size_t c = 0; c < DISTI_BLOCK; c++) {
-            float g = d[u * DISTI_BLOCK + c] * gamma[u];
-            d[u * DISTI_BLOCK + c] = g;
-            mean[c] += g;
-            along[c] += g * hat[u * DISTI_BLOCK + c];
-        }
-    }
-    for (size_t u = 0; u < count; u++)
-        for (size_t c = 0; c < DISTI_BLOCK; c++)
-            d[u * DISTI_BLOCK + c] = (d[u * DISTI_BLOCK + c] - mean[c] / (float)units -
-                                      hat[u * DISTI_BLOCK + c] * (along[c] / (float)units)) * inverse[c];
+    float along[DISTI_BLOCK], cross[DISTI_BLOCK];
+    size_t count = (size_t)units * DISTI_BLOCK;
+    for (size_t u = 0; u < count; u++) d[u] *= gamma[u / DISTI_BLOCK];
+    disti_norm_project(units, half ? half : DISTI_BLOCK, hat, inverse, d, along);
+    if (!half) return;
+    memset(cross, 0, sizeof cross);
+    for (size_t u = half; u < count; u += DISTI_BLOCK)
+        for (size_t c = 0; c < half; c++) cross[c] += d[u + c] * hat[u + c] / (float)units;
+    disti_norm_project(units, half, hat, inverse, d + half, along);
+    for (size_t u = 0; u < count; u += DISTI_BLOCK)
+        for (size_t c = 0; c < half; c++)
+            d[u + c] -= inverse[c] * (hat[u + c] * cross[c] + hat[u + half + c] * along[c] +
+                                      d[u + half + c] * inverse[half + c]);
 }
 
 /* Bits of the positive lanes of each row. */
@@ -3636,13 +3777,12 @@ static void disti_list_alive(const dist_net *net, disti_block *b, int l)
 }
 
 /* A linear layer by the user's BLAS: the previous units' columns, then the point's. */
-static void disti_linear_blas(const dist_shape *shape, int l, const float *x, float *y)
+static void disti_linear_blas(const dist_shape *shape, int l, const float *bias, const float *x, float *y)
 {
     const dist_net *net = shape->net;
     const disti_linear *layer = &net->layer[l];
     const dist_blas *blas = &shape->ctx->blas;
     const float *w = net->params + layer->weight;
-    const float *bias = shape->bias + (size_t)l * (size_t)net->max_rows;
     for (size_t o = 0; o < (size_t)layer->out; o++)
         for (size_t c = 0; c < DISTI_BLOCK; c++) y[o * DISTI_BLOCK + c] = bias[o];
     if (layer->prev > 0)
@@ -3666,6 +3806,46 @@ static void disti_transpose(size_t rows, size_t stride, float scale, const float
         for (size_t c = 0; c < DISTI_BLOCK; c++) xt[c * stride + k] = scale * x[k * DISTI_BLOCK + c];
 }
 
+/* phi'' of a value v = phi(x) whose slope phi'(x) is d. */
+static float disti_curvature(int activation, float scale, float v, float d)
+{
+    switch (activation) {
+    case DIST_ACTIVATION_ELU: return v > 0.0f ? 0.0f : d;
+    case DIST_ACTIVATION_SOFTPLUS: return scale * d * (1.0f - d);
+    case DIST_ACTIVATION_SINE: return -scale * scale * v;
+    case DIST_ACTIVATION_TANH: return -2.0f * v * d;
+    }
+    return 0.0f;
+}
+
+/* The rest of hidden layer l where lanes are values and tangents: W x in y becomes phi(norm(W x + b)) and, along the
+   direction, its derivative phi'(a) a'. slope keeps phi'(a) and, in the tangent's lane, phi''(a) a'. */
+static void disti_hidden_tangents(const dist_shape *shape, const disti_block *b, int l, float *y)
+{
+    const dist_net *net = shape->net;
+    const disti_linear *layer = &net->layer[l];
+    size_t width = (size_t)net->max_rows, out = (size_t)layer->out, half = (size_t)b->half;
+    const float *bias = shape->bias + (size_t)l * width;
+    float own[DISTI_BLOCK], scale = l == 0 ? net->first_scale : net->scale;
+    uint64_t *mask = b->mask + (size_t)(l + 1) * width;
+    for (size_t u = 0; u < out; u++)
+        for (size_t c = 0; c < half; c++) y[u * DISTI_BLOCK + c] += bias[u];
+    if (net->normed)
+        disti_norm(layer->out, net->norm_epsilon, net->params + layer->norm_weight, net->params + layer->norm_bias,
+                   half, y, b->hat + (size_t)l * width * DISTI_BLOCK, b->inverse + (size_t)l * DISTI_BLOCK);
+    for (size_t u = 0; u < out; u++) {
+        float *v = y + u * DISTI_BLOCK, *slope = b->slope ? b->slope + ((size_t)l * width + u) * DISTI_BLOCK : own;
+        disti_activate(net->activation, scale, half, v, slope);
+        mask[u] = 0;
+        for (size_t c = 0; c < half; c++) {
+            slope[half + c] = disti_curvature(net->activation, scale, v[c], slope[c]) * v[half + c];
+            v[half + c] *= slope[c];
+            mask[u] |= (uint64_t)(slope[c] > 0.0f) << c;
+        }
+        mask[u] |= mask[u] << half; /* ReLU's: a value and its tangent are alive together */
+    }
+}
+
 /* Hidden layer l: x to the input of layer l + 1 in y, with everything that its adjoint reads. */
 static void disti_hidden(const dist_shape *shape, const disti_kernels *kernels, disti_block *b, int l, const float *x,
                          float *y)
@@ -3674,15 +3854,16 @@ static void disti_hidden(const dist_shape *shape, const disti_kernels *kernels, 
     const disti_linear *layer = &net->layer[l];
     size_t width = (size_t)net->max_rows, out = (size_t)layer->out;
     uint64_t *mask = b->mask + (size_t)(l + 1) * width;
-    int plain = net->activation == DIST_ACTIVATION_RELU && !net->normed;
+    const float *bias = shape->bias + (size_t)(b->half ? net->layers : l) * width;
+    int plain = net->activation == DIST_ACTIVATION_RELU && !net->normed && !b->half;
     if (disti_use_blas(shape, l)) {
-        disti_linear_blas(shape, l, x, y);
+        disti_linear_blas(shape, l, bias, x, y);
         if (plain) disti_activate(DIST_ACTIVATION_RELU, 1.0f, out * DISTI_BLOCK, y, NULL);
         if (plain) disti_positive(out, y, mask);
     } else {
         disti_gemm g;
         g.weights = net->panels + layer->panel;
-        g.bias = shape->bias + (size_t)l * width;
+        g.bias = bias;
         g.x = x;
         g.y = y;
         g.rows = layer->prev + layer->point;
@@ -3693,10 +3874,12 @@ static void disti_hidden(const dist_shape *shape, const disti_kernels *kernels, 
         g.columns = b->columns;
         kernels->gemm(&g);
     }
-    if (net->normed)
-        disti_norm(layer->out, net->norm_epsilon, net->params + layer->norm_weight, net->params + layer->norm_bias, y,
-                   b->hat + (size_t)l * width * DISTI_BLOCK, b->inverse + (size_t)l * DISTI_BLOCK);
-    if (!plain) {
+    if (net->normed && !b->half)
+        disti_norm(layer->out, net->norm_epsilon, net->params + layer->norm_weight, net->params + layer->norm_bias, 0,
+                   y, b->hat + (size_t)l * width * DISTI_BLOCK, b->inverse + (size_t)l * DISTI_BLOCK);
+    if (b->half) {
+        disti_hidden_tangents(shape, b, l, y);
+    } else if (!plain) {
         float *slope = b->slope ? b->slope + (size_t)l * width * DISTI_BLOCK : NULL;
         disti_activate(net->activation, l == 0 ? net->first_scale : net->scale, out * DISTI_BLOCK, y, slope);
         if (net->activation == DIST_ACTIVATION_RELU) disti_positive(out, y, mask);
@@ -3730,9 +3913,10 @@ static const float *disti_net_forward(const dist_shape *shape, disti_block *b, f
     return x;
 }
 
-/* Channel `channel` of the last layer, B lanes: value after the output function, and its slope. */
+/* Channel `channel` of the last layer, B lanes: value after the output function, its slope and, unless NULL, its
+   curvature. Tangents' lanes of value get the layer's tangent without the function's slope. */
 static void disti_net_output(const dist_shape *shape, const disti_block *b, const float *x, int channel, float *value,
-                             float *slope)
+                             float *slope, float *curvature)
 {
     const dist_net *net = shape->net;
     int l = net->layers - 1;
@@ -3741,26 +3925,28 @@ static void disti_net_output(const dist_shape *shape, const disti_block *b, cons
     disti_kernels kernels = disti_kernels_for(shape->ctx->isa);
     const int *alive = b->alive_count[l] < rows ? b->alive + (size_t)l * (size_t)net->max_rows : NULL;
     float bias = shape->bias[(size_t)l * (size_t)net->max_rows + (size_t)channel];
-    kernels.dot(net->panels + layer->panel + (size_t)channel * (size_t)rows, bias, x, alive, b->alive_count[l], rows,
-                b->columns, value);
-    for (size_t c = 0; c < DISTI_BLOCK; c++) {
-        float v = value[c], d = 1.0f;
+    kernels.dot(net->panels + layer->panel + (size_t)channel * (size_t)rows, b->half ? 0.0f : bias, x, alive,
+                b->alive_count[l], rows, b->columns, value);
+    for (size_t c = 0; c < (b->half ? (size_t)b->half : DISTI_BLOCK); c++) {
+        float v = b->half ? value[c] + bias : value[c], d = 1.0f, bend = 0.0f;
+        int twice = net->output == DISTI_OUTPUT_TANH_TWICE;
         slope[c] = 0.0f;
-        if (net->output == DISTI_OUTPUT_TANH || net->output == DISTI_OUTPUT_TANH_TWICE) {
-            d = disti_tanh_slope(v);
-            v = disti_tanh(v);
-        }
-        if (net->output == DISTI_OUTPUT_TANH_TWICE) {
-            d *= disti_tanh_slope(v);
-            v = disti_tanh(v);
+        if (curvature) curvature[c] = 0.0f;
+        if (!disti_finite(v)) continue; /* value stays what it is: the ray is told */
+        for (int k = 0; k < twice + (twice || net->output == DISTI_OUTPUT_TANH); k++) {
+            float t = disti_tanh(v), s = disti_tanh_slope(v);
+            bend = s * (bend - 2.0f * t * d * d); /* of t(v): t'' v'^2 + t' v'' */
+            d *= s;
+            v = t;
         }
         if (net->output == DISTI_OUTPUT_SIGMOID) {
             d = disti_sigmoid_slope(v);
             v = disti_sigmoid(v);
+            bend = d * (1.0f - 2.0f * v);
         }
-        if (!disti_finite(value[c])) continue; /* stays what it is: the ray is told */
         value[c] = channel == net->sdf_channel ? v - net->level : v;
         slope[c] = d;
+        if (curvature) curvature[c] = bend;
     }
 }
 
@@ -3773,7 +3959,14 @@ static void disti_hidden_delta(const dist_net *net, const disti_block *b, int l,
     if (net->activation == DIST_ACTIVATION_RELU && !net->normed) return;
     if (b->slope) {
         const float *slope = b->slope + (size_t)l * width * DISTI_BLOCK;
-        for (size_t i = 0; i < out * DISTI_BLOCK; i++) delta[i] *= slope[i];
+        size_t half = (size_t)b->half;
+        for (size_t i = 0; i < out * DISTI_BLOCK && !half; i++) delta[i] *= slope[i];
+        for (size_t i = 0; i < out * DISTI_BLOCK && half; i += DISTI_BLOCK) {
+            for (size_t c = i; c < i + half; c++) {
+                delta[c] = slope[c] * delta[c] + slope[c + half] * delta[c + half];
+                delta[c + half] *= slope[c];
+            }
+        }
     }
     if (net->normed) {
         const uint64_t *mask = b->mask + (size_t)(l + 1) * width; /* rows that are not alive were not written */
@@ -3785,11 +3978,12 @@ static void disti_hidden_delta(const dist_net *net, const disti_block *b, int l,
             sums[u] = sums[disti_store_out(layer) + u] = 0.0f;
             for (size_t c = 0; c < (size_t)b->columns; c++) {
                 sums[u] += delta[u * DISTI_BLOCK + c] * hat[u * DISTI_BLOCK + c];
-                sums[disti_store_out(layer) + u] += delta[u * DISTI_BLOCK + c];
+                if (!b->half || c < (size_t)b->half)
+                    sums[disti_store_out(layer) + u] += delta[u * DISTI_BLOCK + c];
             }
         }
-        disti_norm_backward(layer->out, net->params + layer->norm_weight, b->hat + (size_t)l * width * DISTI_BLOCK,
-                            b->inverse + (size_t)l * DISTI_BLOCK, delta);
+        disti_norm_backward(layer->out, net->params + layer->norm_weight, (size_t)b->half,
+                            b->hat + (size_t)l * width * DISTI_BLOCK, b->inverse + (size_t)l * DISTI_BLOCK, delta);
     }
 }
 
@@ -3939,7 +4133,7 @@ static void disti_fold_backward(const dist_net *net, const disti_block *b, size_
     }
 }
 
-/* S += sum_c seed[c] delta[o][c], over the block's own lanes. */
+/* S += sum_c seed[c] delta[o][c], over the block's own lanes but tangents. seed NULL: ones. */
 static void disti_fold_sum(const dist_net *net, const disti_block *b, const float *seed)
 {
     size_t fold = 0;
@@ -3951,7 +4145,8 @@ static void disti_fold_sum(const dist_net *net, const disti_block *b, const floa
         double *sum = b->fold_sum + fold++ * (size_t)net->max_rows;
         for (size_t o = 0; o < out; o++) {
             float part = 0.0f;
-            for (size_t c = 0; c < (size_t)b->columns; c++) part += seed[c] * delta[o * DISTI_BLOCK + c];
+            for (size_t c = 0; c < (size_t)(b->columns - b->half); c++)
+                part += (seed ? seed[c] : 1.0f) * delta[o * DISTI_BLOCK + c];
             sum[o] += (double)part;
         }
     }
@@ -3973,11 +4168,11 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
         float *value = b.tail, *slope = b.tail + DISTI_BLOCK, *seed = b.tail + 2 * DISTI_BLOCK,
               *g = b.tail + 8 * DISTI_BLOCK;
         const float *x = disti_net_forward(shape, &b, NULL, disti_counter_of(shape->ctx, worker));
-        disti_net_output(shape, &b, x, net->sdf_channel, value, slope);
+        disti_net_output(shape, &b, x, net->sdf_channel, value, slope, NULL);
         if (sdf) memcpy(sdf + at, value, count * sizeof(float));
         if (!gradient && !seed_fn) continue;
         disti_net_reverse(shape, &b, slope, NULL);
-        disti_encode_backward(net, b.point, b.d_point, g);
+        disti_encode_backward(net, &b, g);
         if (gradient) memcpy(gradient + 3 * at, g, 3 * count * sizeof(float));
         if (!seed_fn) continue;
         seed_fn(seed_user, at, count, value, g, seed);
@@ -3985,6 +4180,73 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
     }
     if (d_code) disti_fold_backward(net, &b, 0, (size_t)net->code_size, d_code);
 }
+
+#ifndef DIST_NO_BACKWARD
+/* Second order. A block carries B / 2 points p with directions u in two lanes each: lane c is the value, lane c + B / 2
+   its tangent, the derivative along u. Every matrix serves both, in the sums for the weights too.
+   forward   a_l = W_l x_l + b_l,  a'_l = W_l x'_l,  x_l+1 = phi(a_l),  x'_l+1 = phi'(a_l) a'_l;  at the end
+             f = out(a),  s = out'(a) a' = u . grad f
+   backward  of s, with d = dL/d(pre-activation) and d' that of the tangent:  d = out''(a) a',  d' = out'(a);
+             X = W_l^T d_l,  X' = W_l^T d'_l,  d_l-1 = phi'(a) X + phi''(a) a' X',  d'_l-1 = phi'(a) X'
+             d_W_l = sum d x^T + d' x'^T,  d_b_l = sum d,  and the code's columns like the bias: its tangent is 0
+   Leaves d_b of the layers that see the code in b->fold_delta's lanes c, and returns ds/dp = H u (B / 2, 3). */
+static const float *disti_second_block(const dist_shape *shape, int worker, disti_block *b, size_t n,
+                                       const float *points, const float *directions, float *store)
+{
+    const dist_net *net = shape->net;
+    float *value, *slope, *curvature, *seed, *g;
+    disti_block_begin(shape, worker, b, n, points);
+    b->half = DISTI_BLOCK / 2;
+    b->columns = DISTI_BLOCK; /* idle lanes repeat the last point with u = 0 and the seeds 0 */
+    value = b->tail;
+    slope = value + DISTI_BLOCK;
+    curvature = slope + DISTI_BLOCK;
+    seed = curvature + DISTI_BLOCK;
+    g = b->tail + 8 * DISTI_BLOCK;
+    for (size_t c = 0; c < DISTI_BLOCK / 2; c++) {
+        for (int axis = 0; axis < 3; axis++) {
+            float u = c < n ? directions[3 * c + (size_t)axis] : 0.0f, factor = (float)net->base * u;
+            float *row = b->point + c;
+            if (net->raw) row[(size_t)axis * DISTI_BLOCK + DISTI_BLOCK / 2] = u;
+            for (int k = 0; k < net->levels; k++) {
+                size_t s = (size_t)disti_encoding_row(net, k, axis, 0) * DISTI_BLOCK;
+                size_t co = (size_t)disti_encoding_row(net, k, axis, 1) * DISTI_BLOCK;
+                row[s + DISTI_BLOCK / 2] = factor * row[co];
+                row[co + DISTI_BLOCK / 2] = -factor * row[s];
+                factor *= 2.0f;
+            }
+        }
+    }
+    const float *x = disti_net_forward(shape, b, store, disti_counter_of(shape->ctx, worker));
+    disti_net_output(shape, b, x, net->sdf_channel, value, slope, curvature);
+    memset(seed, 0, DISTI_BLOCK * sizeof(float));
+    for (size_t c = 0; c < n; c++) {
+        seed[c] = curvature[c] * value[DISTI_BLOCK / 2 + c];
+        seed[DISTI_BLOCK / 2 + c] = slope[c];
+    }
+    disti_net_reverse(shape, b, seed, store);
+    disti_encode_backward(net, b, g);
+    return g;
+}
+
+/* dist_field.second_fn of a net. */
+static void disti_shape_second(void *user, int worker, size_t n, const float *points, const float *directions,
+                               float *d_points, double *d_code)
+{
+    const dist_shape *shape = (const dist_shape *)user;
+    const dist_net *net = shape->net;
+    disti_block b;
+    disti_block_layout(net, disti_scratch(shape->ctx, worker) + DISTI_FIELD_OFFSET, &b);
+    if (d_code) memset(b.fold_sum, 0, (size_t)net->fold_count * (size_t)net->max_rows * sizeof(double));
+    for (size_t at = 0; at < n; at += DISTI_BLOCK / 2) {
+        size_t count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK / 2);
+        const float *g = disti_second_block(shape, worker, &b, count, points + 3 * at, directions + 3 * at, NULL);
+        for (size_t i = 0; d_points && i < 3 * count; i++) d_points[3 * at + i] += g[i];
+        if (d_code) disti_fold_sum(net, &b, NULL);
+    }
+    if (d_code) disti_fold_backward(net, &b, 0, (size_t)net->code_size, d_code);
+}
+#endif
 
 static void disti_shape_eval_fn(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
 {
@@ -4001,7 +4263,7 @@ static void disti_shape_channels(const dist_shape *shape, int worker, size_t n, 
         disti_block_begin(shape, worker, &b, columns, points + 3 * at);
         const float *x = disti_net_forward(shape, &b, NULL, disti_counter_of(shape->ctx, worker));
         for (int k = 0; k < count; k++) {
-            disti_net_output(shape, &b, x, first + k, b.tail, b.tail + DISTI_BLOCK);
+            disti_net_output(shape, &b, x, first + k, b.tail, b.tail + DISTI_BLOCK, NULL);
             for (size_t c = 0; c < columns; c++) channels[(at + c) * (size_t)count + (size_t)k] = b.tail[c];
         }
     }
@@ -4030,7 +4292,7 @@ static void disti_color_reverse(const dist_shape *paint, int worker, disti_block
     b->channel = paint->net->color_channel;
     b->channels = 3;
     for (int k = 0; k < 3; k++) {
-        disti_net_output(paint, b, x, b->channel + k, value, slope);
+        disti_net_output(paint, b, x, b->channel + k, value, slope, NULL);
         for (size_t c = 0; c < DISTI_BLOCK; c++)
             seed[k * DISTI_BLOCK + (int)c] = c < n ? d_color[3 * c + (size_t)k] * slope[c] : 0.0f;
     }
@@ -4052,7 +4314,7 @@ static void disti_shape_color_adjoint_fn(void *user, int worker, size_t n, const
         disti_block_begin(paint, worker, &b, count, points + 3 * at);
         disti_color_reverse(paint, worker, &b, count, d_color + 3 * at, NULL);
         float *ones = b.tail, *g = b.tail + 8 * DISTI_BLOCK;
-        if (d_points) disti_encode_backward(net, b.point, b.d_point, g);
+        if (d_points) disti_encode_backward(net, &b, g);
         for (size_t i = 0; d_points && i < 3 * count; i++) d_points[3 * at + i] += g[i];
         for (size_t c = 0; c < DISTI_BLOCK; c++) ones[c] = 1.0f;
         if (d_code || d_color_code) disti_fold_sum(net, &b, ones);
@@ -4071,13 +4333,14 @@ typedef struct disti_weights_job {
     size_t n;
     const float *points;
     const float *d_color; /* (n, 3): the channels are r, g, b; NULL: the distance, and what follows is about it */
+    const float *directions; /* not NULL: of second_weights_fn */
     float *d_sdf;
     dist_seed_fn seed_fn;
     void *seed_user;
     float *d_points;
     double *d_code; /* (blocks of the chunk, code_size) or NULL */
     float *d_weights;
-    size_t first;
+    size_t first, block; /* points of a block: B, or B / 2 with directions */
     int blocks;
 } disti_weights_job;
 
@@ -4087,34 +4350,35 @@ static void disti_weights_block(void *arg, int index, int worker)
     const dist_shape *shape = job->shape;
     const dist_net *net = shape->net;
     disti_block b;
-    size_t at = job->first + (size_t)index * DISTI_BLOCK;
-    size_t count = DISTI_MIN(job->n - at, (size_t)DISTI_BLOCK);
+    size_t at = job->first + (size_t)index * job->block;
+    size_t count = DISTI_MIN(job->n - at, job->block);
     float *store = shape->store + (size_t)index * shape->store_block_size;
-    disti_block_begin(shape, worker, &b, count, job->points + 3 * at);
-    if (job->d_color) {
-        disti_color_reverse(shape, worker, &b, count, job->d_color + 3 * at, store);
-        return;
+    const float *pull;
+    if (job->directions) {
+        pull = disti_second_block(shape, worker, &b, count, job->points + 3 * at, job->directions + 3 * at, store);
+    } else {
+        disti_block_begin(shape, worker, &b, count, job->points + 3 * at);
+        if (job->d_color) {
+            disti_color_reverse(shape, worker, &b, count, job->d_color + 3 * at, store);
+            return;
+        }
+        float *value = b.tail, *slope = b.tail + DISTI_BLOCK, *seed = b.tail + 2 * DISTI_BLOCK,
+              *g = b.tail + 8 * DISTI_BLOCK;
+        const float *x = disti_net_forward(shape, &b, store, disti_counter_of(shape->ctx, worker));
+        disti_net_output(shape, &b, x, net->sdf_channel, value, slope, NULL);
+        if (job->seed_fn) job->seed_fn(job->seed_user, at, count, value, NULL, seed);
+        else memcpy(seed, job->d_sdf + at, count * sizeof(float));
+        if (job->seed_fn && job->d_sdf) memcpy(job->d_sdf + at, seed, count * sizeof(float));
+        for (size_t c = 0; c < DISTI_BLOCK; c++) seed[c] = c < count ? seed[c] * slope[c] : 0.0f;
+        disti_net_reverse(shape, &b, seed, store);
+        disti_encode_backward(net, &b, g);
+        pull = g;
     }
-    float *value = b.tail, *slope = b.tail + DISTI_BLOCK, *seed = b.tail + 2 * DISTI_BLOCK,
-          *g = b.tail + 8 * DISTI_BLOCK;
-    const float *x = disti_net_forward(shape, &b, store, disti_counter_of(shape->ctx, worker));
-    disti_net_output(shape, &b, x, net->sdf_channel, value, slope);
-    if (job->seed_fn) job->seed_fn(job->seed_user, at, count, value, NULL, seed);
-    else memcpy(seed, job->d_sdf + at, count * sizeof(float));
-    if (job->seed_fn && job->d_sdf) memcpy(job->d_sdf + at, seed, count * sizeof(float));
-    for (size_t c = 0; c < DISTI_BLOCK; c++) seed[c] = c < count ? seed[c] * slope[c] : 0.0f;
-    disti_net_reverse(shape, &b, seed, store);
-    if (job->d_points) {
-        disti_encode_backward(net, b.point, b.d_point, g);
-        for (size_t i = 0; i < 3 * count; i++) job->d_points[3 * at + i] += g[i];
-    }
-    if (job->d_code) {
-        for (size_t c = 0; c < DISTI_BLOCK; c++) value[c] = 1.0f;
-        memset(b.fold_sum, 0, (size_t)net->fold_count * (size_t)net->max_rows * sizeof(double));
-        disti_fold_sum(net, &b, value);
-        disti_fold_backward(net, &b, 0, (size_t)net->code_size,
-                            job->d_code + (size_t)index * (size_t)net->code_size);
-    }
+    for (size_t i = 0; job->d_points && i < 3 * count; i++) job->d_points[3 * at + i] += pull[i];
+    if (!job->d_code) return;
+    memset(b.fold_sum, 0, (size_t)net->fold_count * (size_t)net->max_rows * sizeof(double));
+    disti_fold_sum(net, &b, NULL);
+    disti_fold_backward(net, &b, 0, (size_t)net->code_size, job->d_code + (size_t)index * (size_t)net->code_size);
 }
 
 enum { DISTI_WEIGHT_ROWS = 64 }; /* outputs of one task of the second phase */
@@ -4136,7 +4400,8 @@ static void disti_weights_rows(const disti_weights_job *job, int l, size_t o, si
     const float *xt = store + disti_store_offset(net, l, DISTI_STORE_INPUT);
     const float *delta = store + disti_store_offset(net, l, DISTI_STORE_DELTA) + o * DISTI_BLOCK;
     size_t row = l + 1 == net->layers ? (size_t)disti_weights_channel(job) : o;
-    size_t columns = DISTI_MIN(job->n - job->first - (size_t)index * DISTI_BLOCK, (size_t)DISTI_BLOCK);
+    size_t values = DISTI_MIN(job->n - job->first - (size_t)index * job->block, job->block);
+    size_t columns = job->directions ? DISTI_BLOCK : values; /* tangents have no share in the bias */
     float *w = job->d_weights + layer->weight + row * (size_t)layer->in;
     disti_gemm_weights g;
     g.d_y = delta;
@@ -4150,7 +4415,7 @@ static void disti_weights_rows(const disti_weights_job *job, int l, size_t o, si
     if (layer->prev > 0) kernels.gemm_weights(&g);
     for (size_t i = 0; i < count; i++) {
         float sum = 0.0f;
-        for (size_t c = 0; c < columns; c++) sum += delta[i * DISTI_BLOCK + c];
+        for (size_t c = 0; c < values; c++) sum += delta[i * DISTI_BLOCK + c];
         job->d_weights[layer->bias + row + i] += sum;
         float *to = w + i * (size_t)layer->in;
         for (size_t k = 0; k < (size_t)layer->point; k++) {
@@ -4195,9 +4460,10 @@ static void disti_weights_run(disti_weights_job *job, dist_context *ctx, double 
     size_t size = (size_t)net->code_size;
     int tasks = 1;
     for (int l = 0; l + 1 < net->layers; l++) tasks += (net->layer[l].out + DISTI_WEIGHT_ROWS - 1) / DISTI_WEIGHT_ROWS;
+    job->block = job->directions ? DISTI_BLOCK / 2 : DISTI_BLOCK;
     job->d_code = d_code ? ctx->partial : NULL;
-    for (; job->first < job->n; job->first += (size_t)shape->store_blocks * DISTI_BLOCK) {
-        size_t left = (job->n - job->first + DISTI_BLOCK - 1) / DISTI_BLOCK;
+    for (; job->first < job->n; job->first += (size_t)shape->store_blocks * job->block) {
+        size_t left = (job->n - job->first + job->block - 1) / job->block;
         job->blocks = left < (size_t)shape->store_blocks ? (int)left : shape->store_blocks;
         if (d_code) memset(ctx->partial, 0, (size_t)job->blocks * size * sizeof(double));
         disti_run(ctx, job->blocks, disti_weights_block, job);
@@ -4220,6 +4486,23 @@ static dist_status disti_shape_weights_fn(void *user, dist_context *ctx, size_t 
     job.d_sdf = d_sdf;
     job.seed_fn = seed_fn;
     job.seed_user = seed_user;
+    job.d_points = d_points;
+    job.d_weights = d_weights;
+    disti_weights_run(&job, ctx, d_code);
+    return DIST_OK;
+}
+
+/* dist_field.second_weights_fn of a net. */
+static dist_status disti_shape_second_weights(void *user, dist_context *ctx, size_t n, const float *points,
+                                              const float *directions, float *d_points, double *d_code,
+                                              float *d_weights)
+{
+    disti_weights_job job;
+    memset(&job, 0, sizeof job);
+    job.shape = (const dist_shape *)user;
+    job.n = n;
+    job.points = points;
+    job.directions = directions;
     job.d_points = d_points;
     job.d_weights = d_weights;
     disti_weights_run(&job, ctx, d_code);
@@ -4290,8 +4573,12 @@ DIST_API dist_field dist_shape_field(dist_shape *shape)
     if (net->sdf_channel >= 0) {
         field.eval_fn = disti_shape_eval_fn;
         field.fused_fn = disti_shape_fused;
+#ifndef DIST_NO_BACKWARD
+        field.second_fn = disti_shape_second;
+#endif
 #ifndef DIST_NO_TRAIN
         field.weights_fn = disti_shape_weights_fn;
+        field.second_weights_fn = disti_shape_second_weights;
 #endif
     }
     if (shape->texture || net->color_channel >= 0) {
@@ -4311,6 +4598,7 @@ DIST_API dist_field dist_shape_field(dist_shape *shape)
     field.radius = net->bound;
     field.lipschitz = shape->lipschitz;
     field.clamp = net->clamp;
+    field.kinks = net->activation == DIST_ACTIVATION_RELU;
     field.code_size = net->code_size;
     return field;
 }
@@ -4322,7 +4610,6 @@ static void disti_shape_fold(dist_shape *shape)
     for (int l = 0; l < net->layers; l++) {
         const disti_linear *layer = &net->layer[l];
         float *bias = shape->bias + (size_t)l * (size_t)net->max_rows;
-        memset(bias, 0, (size_t)net->max_rows * sizeof(float));
         for (size_t o = 0; o < (size_t)layer->out; o++) {
             const float *w = net->params + layer->weight + o * (size_t)layer->in + layer->code_column;
             double sum = 0.0;
@@ -4376,7 +4663,7 @@ DIST_API void dist_shape_destroy(dist_shape *shape)
     const dist_net *net = shape->net;
     dist_shape_destroy(shape->texture);
     disti_free(ctx, shape->store, (size_t)shape->store_blocks * shape->store_block_size * sizeof(float));
-    disti_free(ctx, shape->bias, (size_t)net->layers * (size_t)net->max_rows * sizeof(float));
+    disti_free(ctx, shape->bias, (size_t)(net->layers + 1) * (size_t)net->max_rows * sizeof(float));
     disti_free(ctx, shape->code, (size_t)net->code_size * sizeof(float));
     disti_free(ctx, shape, sizeof *shape);
 }
@@ -4398,8 +4685,9 @@ DIST_API dist_shape *dist_shape_create(dist_context *ctx, const dist_net *net, c
     shape->ctx = ctx;
     shape->net = net;
     shape->code = (float *)disti_alloc(ctx, (size_t)net->code_size * sizeof(float));
-    shape->bias = (float *)disti_alloc(ctx, (size_t)net->layers * (size_t)net->max_rows * sizeof(float));
+    shape->bias = (float *)disti_alloc(ctx, (size_t)(net->layers + 1) * (size_t)net->max_rows * sizeof(float));
     if (!shape->code || !shape->bias) goto fail;
+    memset(shape->bias, 0, (size_t)(net->layers + 1) * (size_t)net->max_rows * sizeof(float));
 #ifndef DIST_NO_TRAIN
     if (net->sdf_channel >= 0 || net->color_channel >= 0) {
         size_t block = disti_store_offset(net, net->layers, DISTI_STORE_INPUT);
@@ -6912,8 +7200,7 @@ static void disti_paper_trace(const disti_tracer *tracer, int worker, const dist
 
 /*@ 08 render ------------------------------------------------------------------------------------------------------- */
 
-/* Points of the backward pass held at once, and pixels whose colors go back at once. */
-enum { DISTI_CHUNK = DISTI_SLOTS * 4 * DISTI_BLOCK, DISTI_RUN = DISTI_SLOTS * DISTI_BLOCK };
+enum { DISTI_RUN = DISTI_SLOTS * DISTI_BLOCK }; /* pixels whose colors go back at once */
 
 /* One point of the backward pass. */
 typedef struct disti_entry {

@@ -1,6 +1,7 @@
 /* SPDX-License-Identifier: MIT-0
    fit_pose.c - a known shape and one depth image of it in, the camera out: rotation and translation are moved until the
-   rendered depth and silhouette agree with the picture.
+   rendered depth and silhouette agree with the picture. The paper shows this for one aeroplane with a figure and no
+   number; --trials counts how often it succeeds.
    cc -O2 examples/fit_pose.c -lm -o fit_pose && ./fit_pose --target 3 --out out/pose */
 #define DIST_IMPLEMENTATION
 #include "../dist.h"

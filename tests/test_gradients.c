@@ -1284,6 +1284,88 @@ static dist_render_desc implicit_how(void)
     return how;
 }
 
+/* ---- the camera of a known shape --------------------------------------------------------------------------------- */
+
+/* Adam on the camera's six numbers, or on its four of the lens, until the depth and silhouette of a box agree. */
+static void recover_camera(int lens, const dist_render_desc *how)
+{
+    enum { STEPS = 300 };
+    static pictures seen, a;
+    static float d_depth[PIXELS], d_silhouette[PIXELS];
+    scene s;
+    float moments[12] = {0};
+    dist_adam adam;
+    dist_images d_out;
+    scene_analytic(&s, BOX);
+    dist_camera truth = s.camera;
+    dist_tape_destroy(pictures_take(&seen, &s, how));
+    memset(&adam, 0, sizeof adam);
+    memset(&d_out, 0, sizeof d_out);
+    adam.moments = moments;
+    d_out.depth = d_depth;
+    d_out.silhouette = d_silhouette;
+    float w[3] = {0.12f, -0.15f, 0.1f}, t[3] = {0.06f, -0.08f, 0.1f};
+    if (lens) {
+        s.camera.fx *= 1.1f;
+        s.camera.fy *= 0.92f;
+        s.camera.cx += 1.5f;
+        s.camera.cy -= 1.0f;
+    } else {
+        dist_camera_move(&s.camera, w, t);
+    }
+    for (int i = 0; i < STEPS; i++) {
+        float g[6] = {0}, x[6] = {0};
+        dist_gradients grads;
+        memset(&grads, 0, sizeof grads);
+        if (lens) {
+            grads.focal = g;
+            grads.principal = g + 2;
+        } else {
+            grads.rotation = g;
+            grads.translation = g + 3;
+        }
+        memset(d_depth, 0, sizeof d_depth);
+        memset(d_silhouette, 0, sizeof d_silhouette);
+        dist_tape *tape = pictures_take(&a, &s, how);
+        dist_loss_depth(PIXELS, a.depth, seen.depth, a.mask, 10.0f, d_depth);
+        dist_loss_silhouette(PIXELS, a.silhouette, seen.mask, 30.0f, d_silhouette);
+        CHECK_STATUS(DIST_OK, dist_render_backward(s.ctx, tape, &d_out, &grads), s.ctx);
+        dist_tape_destroy(tape);
+        adam.rate = (lens ? 0.2f : 0.03f) * (float)pow(1e-3, (double)i / STEPS);
+        adam.beta2 = 0.99f;
+        dist_adam_step(&adam, 6, x, g);
+        if (lens) {
+            s.camera.fx += x[0];
+            s.camera.fy += x[1];
+            s.camera.cx += x[2];
+            s.camera.cy += x[3];
+        } else {
+            dist_camera_move(&s.camera, x, x + 3);
+        }
+    }
+    for (int k = 0; k < 9; k++) CHECK_NEAR(truth.rotation[k], s.camera.rotation[k], 1e-3);
+    for (int k = 0; k < 3; k++) CHECK_NEAR(truth.translation[k], s.camera.translation[k], 1e-3);
+    CHECK_NEAR(truth.fx, s.camera.fx, 1e-2);
+    CHECK_NEAR(truth.fy, s.camera.fy, 1e-2);
+    CHECK_NEAR(truth.cx, s.camera.cx, 1e-2);
+    CHECK_NEAR(truth.cy, s.camera.cy, 1e-2);
+    scene_close(&s);
+}
+
+TEST(a_boxs_pose_is_recovered_from_12_degrees_off)
+{
+    dist_render_desc how = implicit_how();
+    recover_camera(0, &how);
+    how.gradient = DIST_GRADIENT_PAPER;
+    recover_camera(0, &how);
+}
+
+TEST(a_lens_is_recovered_from_a_tenth_off)
+{
+    dist_render_desc how = implicit_how();
+    recover_camera(1, &how);
+}
+
 /* ---- what is added, skipped, and refused ------------------------------------------------------------------------- */
 
 TEST(a_zero_upstream_gradient_costs_no_point)
@@ -1894,6 +1976,8 @@ int main(int argc, char **argv)
     RUN(paper_mode_after_the_papers_tracer_is_alpha_df_summed_over_the_samples);
 #endif
     RUN(capped_rays_are_counted_and_count_as_tau);
+    RUN(a_boxs_pose_is_recovered_from_12_degrees_off);
+    RUN(a_lens_is_recovered_from_a_tenth_off);
     RUN(a_zero_upstream_gradient_costs_no_point);
     RUN(an_upstream_gradient_that_is_not_finite_counts_as_zero);
     RUN(gradients_are_added_to_what_is_there);

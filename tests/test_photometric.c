@@ -1,6 +1,9 @@
 /* SPDX-License-Identifier: MIT-0
-   The photometric loss: its value and its gradients against the formula in double, and what must not count. */
+   The photometric loss: its value and its gradients against the formula in double, and what must not count; and the
+   rasterizer of the examples' mesh baseline. */
 #include "test.h"
+
+#include "../examples/raster.h"
 
 enum { W = 26, H = 22, PIXELS = W * H };
 
@@ -467,6 +470,97 @@ TEST(photos_may_differ_in_size_and_be_one_pixel_wide)
     CHECK(dist_loss_photometric(&c.to, &big_photo, NULL, 1.0f, d_depth, NULL) >= 0);
 }
 
+/* The baseline of fit_photos: depth of a mesh in place of the rays'. */
+TEST(raster_depth_of_a_mesh_is_that_of_the_rays)
+{
+    static sphere_pair s;
+    static float depth[SPHERE_PIXELS];
+    static unsigned char mask[SPHERE_PIXELS];
+    static unsigned triangle[SPHERE_PIXELS];
+    float numbers[4] = {0.05f, -0.1f, 0, 0.6f};
+    sphere_photos(&s, numbers);
+    dist_field field = dist_field_sphere(numbers);
+    dist_mesh_desc how;
+    memset(&how, 0, sizeof how);
+    how.resolution = 64;
+    how.refine = 1;
+    dist_mesh *mesh = dist_mesh_extract(s.ctx, &field, &how);
+    REQUIRE(mesh);
+    raster_depth(&s.camera[0], mesh, depth, mask, triangle);
+    int inner = 0;
+    for (int i = 0; i < SPHERE_PIXELS; i++) {
+        if (!s.inner[i]) continue;
+        inner++;
+        CHECK_EQUAL(1, mask[i]);
+        CHECK(triangle[i] > 0);
+        CHECK_NEAR(s.depth[0][i], depth[i], 1e-3);
+    }
+    CHECK(inner > SPHERE_PIXELS / 8);
+
+    /* and so is the gradient that the same change of depth gives the code, once by the mesh and once by the rays */
+    static float d_depth[SPHERE_PIXELS];
+    float by_mesh[4] = {0, 0, 0, 0}, by_rays[4] = {0, 0, 0, 0};
+    for (int i = 0; i < SPHERE_PIXELS; i++) d_depth[i] = s.inner[i] ? 1.0f + 0.03f * (float)(i % SPHERE_SIDE) : 0.0f;
+    float *d_vertices = (float *)calloc(3 * mesh->vertex_count, sizeof(float));
+    REQUIRE(d_vertices);
+    raster_backward(&s.camera[0], mesh, triangle, d_depth, d_vertices);
+    dist_gradients grads;
+    memset(&grads, 0, sizeof grads);
+    grads.code = by_mesh;
+    CHECK_STATUS(DIST_OK, dist_mesh_backward(s.ctx, &field, mesh, d_vertices, &grads), s.ctx);
+    sphere_render(&s, numbers, 0, 1);
+    dist_images d_out;
+    memset(&d_out, 0, sizeof d_out);
+    d_out.depth = d_depth;
+    grads.code = by_rays;
+    CHECK_STATUS(DIST_OK, dist_render_backward(s.ctx, s.tape, &d_out, &grads), s.ctx);
+    for (int k = 0; k < 4; k++) CHECK_NEAR(by_rays[k], by_mesh[k], 0.02 * fabs((double)by_rays[3]));
+    free(d_vertices);
+    dist_mesh_destroy(mesh);
+    dist_tape_destroy(s.tape);
+    dist_context_destroy(s.ctx);
+}
+
+/* One corner of four moves; pixels that change their triangle meanwhile have a kink and are left out and counted. */
+TEST(raster_gradient_is_the_central_difference_of_its_depth)
+{
+    static float depth[2][PIXELS], d_depth[PIXELS];
+    static unsigned char mask[PIXELS];
+    static unsigned triangle[3][PIXELS];
+    dist_context *ctx = test_context();
+    float vertices[12] = {-1.1f, -0.9f, 0.1f, 1.2f, -1.0f, -0.3f, 1.0f, 0.9f, 0.2f, -1.0f, 1.1f, -0.4f};
+    float eye[3] = {0.4f, 0.3f, -3.0f}, at[3] = {0, 0, 0}, up[3] = {0, 1, 0};
+    unsigned faces[6] = {0, 1, 2, 0, 2, 3};
+    dist_camera camera = dist_camera_look_at(W, H, 0.8f, eye, at, up);
+    dist_mesh *mesh = dist_mesh_create(ctx, 4, vertices, 2, faces);
+    REQUIRE(mesh);
+    camera.skew = 1.5f;
+    test_random r = test_random_seed(5);
+    raster_depth(&camera, mesh, depth[0], mask, triangle[0]);
+    for (size_t j = 0; j < 12; j++) {
+        float d_vertices[12] = {0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0}, h = 1e-3f;
+        for (int side = 0; side < 2; side++) {
+            mesh->vertices[j] = vertices[j] + (side ? h : -h);
+            raster_depth(&camera, mesh, depth[side], mask, triangle[1 + side]);
+        }
+        mesh->vertices[j] = vertices[j];
+        int excluded = 0, covered = 0;
+        double change = 0;
+        for (size_t i = 0; i < PIXELS; i++) {
+            int kink = triangle[1][i] != triangle[0][i] || triangle[2][i] != triangle[0][i];
+            d_depth[i] = kink ? 0.0f : test_random_float(&r, 0, 1);
+            covered += triangle[0][i] > 0;
+            excluded += kink;
+            change += (double)d_depth[i] * ((double)depth[1][i] - (double)depth[0][i]) / (2 * (double)h);
+        }
+        raster_backward(&camera, mesh, triangle[0], d_depth, d_vertices);
+        CHECK_NEAR(change, d_vertices[j], 1e-3 * (1 + fabs(change)));
+        CHECK(covered > PIXELS / 3 && excluded * 10 < covered);
+    }
+    dist_mesh_destroy(mesh);
+    dist_context_destroy(ctx);
+}
+
 int main(int argc, char **argv)
 {
     test_begin(argc, argv);
@@ -478,5 +572,7 @@ int main(int argc, char **argv)
     RUN(what_the_other_view_cannot_see_does_not_count);
     RUN(photometric_loss_of_bad_arguments_is_zero);
     RUN(photos_may_differ_in_size_and_be_one_pixel_wide);
+    RUN(raster_depth_of_a_mesh_is_that_of_the_rays);
+    RUN(raster_gradient_is_the_central_difference_of_its_depth);
     return test_report();
 }

@@ -267,6 +267,45 @@ DIST_API dist_status dist_field_eikonal(dist_context *ctx, const dist_field *fie
                                         float weight, float *loss, const dist_gradients *grads);
 #endif
 
+/* Places a shape in the world: x_world = scale rotation x_shape + translation. */
+typedef struct dist_similarity {
+    float scale;       /* above 0; 0: 1 */
+    float rotation[9]; /* row-major; all 0: identity */
+    float translation[3];
+} dist_similarity;
+
+/* scale *= exp(step[0]), rotation <- exp([step[1..3]]x) rotation, kept orthonormal, translation += step[4..6]: the step
+   for a gradient of a placement's seven numbers. */
+DIST_API void dist_similarity_move(dist_similarity *placement, const float step[7]);
+
+/* A field and where it stands. */
+typedef struct dist_instance {
+    const dist_field *field; /* copied; what it points to is borrowed while the scene is used */
+    dist_similarity placement;
+} dist_instance;
+
+/* Several instances as one field: f(p) = min over i of s_i f_i(R_i^T (p - t_i) / s_i). A point asks only the instances
+   whose bounding spheres can hold the minimum, nearest first, and none of them outside its sphere: there f_i goes on as
+   a lower bound of the distance, exact up to a fifth of the sphere's radius. Belongs to the context that made it. */
+typedef struct dist_scene dist_scene;
+/* NULL on failure. Instances may share fields; a scene's field may be an instance of another scene. */
+DIST_API dist_scene *dist_scene_create(dist_context *ctx, int count, const dist_instance *instances);
+DIST_API void dist_scene_destroy(dist_scene *scene);
+/* Moves an instance or replaces its field (NULL: it stays) by one whose code is as long and that has a color if the old
+   one had. No allocator call. Take dist_scene_field again afterwards: the bounding sphere changes. */
+DIST_API dist_status dist_scene_set(dist_scene *scene, int index, const dist_instance *instance);
+/* The scene as a field. Borrows the scene. It has a color if every instance has, and no gradient for weights. Its code
+   are, for each instance, its field's code (nothing if that has no adjoint), then its placement as dist_similarity_move
+   has it: log-scale, w of R' = exp([w]x) R, translation. dist_gradients.code gets the gradients for all of them. */
+DIST_API dist_field dist_scene_field(dist_scene *scene);
+/* Where instance `index` begins in the scene's code; its placement are the seven numbers before instance index + 1.
+   index = count: all of them. -1 out of range. */
+DIST_API int dist_scene_offset(const dist_scene *scene, int index);
+/* Which instance is nearest to each of n points, index (n): after dist_trace, what was hit. */
+DIST_API dist_status dist_scene_find(dist_scene *scene, size_t n, const float *points, int *index);
+/* Points that the instances' fields were asked since the scene was made. */
+DIST_API unsigned long long dist_scene_queries(const dist_scene *scene);
+
 /* ---- 05 net ------------------------------------------------------------------------------------------------------ */
 
 /* Weights of a decoder: read-only after creation, shared by any number of shapes and contexts. */
@@ -2075,6 +2114,18 @@ static void disti_orthonormalize(double m[9])
     disti_cross(m, m + 3, m + 6);
 }
 
+/* How far the rows are from orthonormal, and the determinant, if they are. */
+static double disti_rotation_off(const double m[9], double *determinant)
+{
+    double c[3], worst = 0.0;
+    for (int i = 0; i < 3; i++)
+        for (int j = i; j < 3; j++)
+            worst = DISTI_MAX(worst, fabs(disti_dot(m + 3 * i, m + 3 * j) - (i == j ? 1.0 : 0.0)));
+    disti_cross(m, m + 3, c);
+    *determinant = disti_dot(c, m + 6);
+    return worst;
+}
+
 /* m <- exp([w]x) m by Rodrigues: exp([w]x) = I + a [w]x + b [w]x^2, a = sin|w| / |w|, b = (1 - cos|w|) / |w|^2;
    kept orthonormal. */
 static void disti_turn(const float w[3], float m[9])
@@ -2387,6 +2438,23 @@ DIST_API dist_status dist_color_eval(dist_context *ctx, const dist_field *field,
     return DIST_OK;
 }
 
+/* Value, gradient, seeds and code adjoint of any field: fused where it can, else block by block. */
+static void disti_field_fused(const dist_field *field, int worker, size_t n, const float *points, dist_seed_fn seed_fn,
+                              void *seed_user, double *d_code)
+{
+    if (field->fused_fn) {
+        field->fused_fn(field->user, worker, n, points, NULL, NULL, seed_fn, seed_user, d_code);
+        return;
+    }
+    for (size_t at = 0; at < n; at += DISTI_BLOCK) {
+        float sdf[DISTI_BLOCK], gradient[3 * DISTI_BLOCK], d_sdf[DISTI_BLOCK];
+        size_t count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK);
+        field->eval_fn(field->user, worker, count, points + 3 * at, sdf, gradient);
+        seed_fn(seed_user, at, count, sdf, gradient, d_sdf);
+        if (d_code) field->adjoint_fn(field->user, worker, count, points + 3 * at, d_sdf, d_code);
+    }
+}
+
 #ifndef DIST_NO_BACKWARD
 /* dist_color_backward behind the door: totals in double, in slot order. ctx->partial is large enough. */
 static void disti_color_backward_all(dist_context *ctx, const dist_field *field, size_t n, const float *points,
@@ -2461,17 +2529,7 @@ static void disti_backward_task(void *arg, int index, int worker)
                          job->d_points ? job->d_points + 3 * piece.first : NULL, d_code);
         return;
     }
-    if (field->fused_fn) {
-        field->fused_fn(field->user, worker, n, points, NULL, NULL, disti_backward_seed, &piece, d_code);
-        return;
-    }
-    for (size_t at = 0; at < n; at += DISTI_BLOCK) {
-        float sdf[DISTI_BLOCK], gradient[3 * DISTI_BLOCK], d_sdf[DISTI_BLOCK];
-        size_t count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK);
-        field->eval_fn(field->user, worker, count, points + 3 * at, sdf, gradient);
-        disti_backward_seed(&piece, at, count, sdf, gradient, d_sdf);
-        if (d_code) field->adjoint_fn(field->user, worker, count, points + 3 * at, d_sdf, d_code);
-    }
+    disti_field_fused(field, worker, n, points, disti_backward_seed, &piece, d_code);
 }
 
 /* Runs job over its n points: d_code in double, partial sums in slot order. ctx->partial is large enough. */
@@ -2703,6 +2761,625 @@ DIST_API dist_status dist_field_eikonal(dist_context *ctx, const dist_field *fie
     return status;
 }
 #endif
+
+/* Scenes. An instance's field lives in its bounding sphere (center c, radius r), q is p in the shape's space,
+   d = |q - c| - r, m = r / 5. What is asked of it stays within the sphere; outside it goes on as a lower bound of the
+   distance:
+
+     placement   x = s R q + t,   q = R^T (p - t) / s,   f_i(p) = s phi(q)
+     d <= 0      b = f(q)
+     0 < d       b = sqrt(d^2 + v^2),  v = max(f(c + r n), 0),  n = (q - c) / |q - c|      (a ball is convex)
+     phi         min(b, m + |d - m|): continuous, no steeper than f or 1, b itself wherever b < m, and d where d >= m,
+                 which needs no query
+     scene       f(p) = min_i f_i(p): in order of d, instances are asked while s d is below the least value so far
+
+   backward    grad f_i = R grad phi
+               of b, d <= 0: grad b = g, df_i = s df
+               of b, d > 0: grad b = (d n + v r / (r + d) (g - n (n . g))) / b, df_i = s v / b df;  g = grad f
+               of the rest: grad = n sign(d - m), df_i = 0
+               d log s: f - grad f . (p - t)    d w: grad f x (p - t)    d t: -grad f     with R' = exp([w]x) R,
+               from dq = -q d log s - R^T (w x (p - t) + dt) / s, whatever branch phi took */
+typedef struct disti_placed {
+    dist_field field;
+    float scale, rotation[9], translation[3];
+    size_t code, offset; /* numbers of its field's code that have an adjoint; where they stand in the scene's */
+} disti_placed;
+
+typedef struct disti_ball {
+    float center[3], radius, margin; /* world */
+} disti_ball;
+
+struct dist_scene {
+    dist_context *ctx;
+    int count;
+    disti_placed *placed;
+    disti_ball *ball;
+    unsigned char *scratch; /* ctx->workers times scratch_bytes */
+    size_t scratch_bytes, code_size;
+};
+
+enum { DISTI_SCENE_CHUNK = 2048 };
+
+/* A worker's share of a scene's memory, for a chunk of points. */
+typedef struct disti_scene_work {
+    unsigned long long *queries;
+    int *start;    /* (count + 1): of each instance's group in order, point */
+    int *order;    /* points by instance */
+    float *local;  /* (n, 3): what is asked, by instance */
+    float *value, *slope;
+    int *choice;   /* instance to ask, -1: none */
+    float *lower;  /* d of it, world */
+    float *best;   /* least value so far */
+    int *winner;   /* its instance */
+    unsigned char *asked; /* whether it came of a query rather than from a sphere */
+    int *kept;     /* choices put aside while other points are settled; -2: not put aside */
+} disti_scene_work;
+
+static size_t disti_scene_layout(const dist_scene *scene, unsigned char *base, disti_scene_work *w)
+{
+    size_t at = 0, n = DISTI_SCENE_CHUNK;
+    w->queries = (unsigned long long *)disti_take(base, &at, 1, sizeof(unsigned long long));
+    w->start = (int *)disti_take(base, &at, (size_t)scene->count + 1, sizeof(int));
+    w->order = (int *)disti_take(base, &at, n, sizeof(int));
+    w->local = (float *)disti_take(base, &at, n, 3 * sizeof(float));
+    w->value = (float *)disti_take(base, &at, n, sizeof(float));
+    w->slope = (float *)disti_take(base, &at, n, 3 * sizeof(float));
+    w->choice = (int *)disti_take(base, &at, n, sizeof(int));
+    w->lower = (float *)disti_take(base, &at, n, sizeof(float));
+    w->best = (float *)disti_take(base, &at, n, sizeof(float));
+    w->winner = (int *)disti_take(base, &at, n, sizeof(int));
+    w->asked = (unsigned char *)disti_take(base, &at, n, 1);
+    w->kept = (int *)disti_take(base, &at, n, sizeof(int));
+    return at;
+}
+
+static float disti_ball_distance(const disti_ball *ball, const float *p)
+{
+    return disti_length(p[0] - ball->center[0], p[1] - ball->center[1], p[2] - ball->center[2]) - ball->radius;
+}
+
+/* q of p, and d and n in the shape's space. */
+static float disti_placed_local(const disti_placed *placed, const float *p, float q[3], float n[3])
+{
+    const float *m = placed->rotation, *c = placed->field.center;
+    float x[3];
+    for (int i = 0; i < 3; i++) x[i] = (p[i] - placed->translation[i]) / placed->scale;
+    for (int i = 0; i < 3; i++) {
+        q[i] = m[i] * x[0] + m[3 + i] * x[1] + m[6 + i] * x[2];
+        n[i] = q[i] - c[i];
+    }
+    float length = disti_length(n[0], n[1], n[2]);
+    for (int i = 0; i < 3; i++) n[i] = length > 0.0f ? n[i] / length : 0.0f;
+    return length - placed->field.radius;
+}
+
+/* f_i and, from g = grad f, its gradient, and df_i/df; f: the field's answer. g and gradient may be NULL. */
+static float disti_placed_value(const disti_placed *placed, const float *p, float f, const float *g, float *gradient,
+                                float *weight)
+{
+    float q[3], n[3], slope[3] = {0.0f, 0.0f, 0.0f}, r = placed->field.radius, m = 0.2f * r, along = 0.0f;
+    float d = disti_placed_local(placed, p, q, n), b = f, w = 1.0f, cap = m + (d > m ? d - m : m - d);
+    for (int i = 0; g && i < 3; i++) {
+        slope[i] = g[i];
+        along += n[i] * g[i];
+    }
+    if (d > 0.0f && disti_finite(f)) {
+        float v = DISTI_MAX(f, 0.0f);
+        b = sqrtf(d * d + v * v);
+        w = v / b;
+        for (int i = 0; i < 3; i++) slope[i] = (d * n[i] + v * r / (r + d) * (slope[i] - n[i] * along)) / b;
+    }
+    if (disti_finite(f) && b > cap) {
+        b = cap;
+        w = 0.0f;
+        for (int i = 0; i < 3; i++) slope[i] = d > m ? n[i] : -n[i];
+    }
+    const float *rotation = placed->rotation;
+    for (int i = 0; gradient && i < 3; i++)
+        gradient[i] = rotation[3 * i] * slope[0] + rotation[3 * i + 1] * slope[1] + rotation[3 * i + 2] * slope[2];
+    if (weight) *weight = placed->scale * w;
+    return placed->scale * b;
+}
+
+/* The instance to ask after (lower, choice): the next by d that may hold the minimum. */
+static void disti_scene_next(const dist_scene *scene, const float *p, disti_scene_work *w, size_t i)
+{
+    float after = w->lower[i], least = w->best[i];
+    int last = w->choice[i];
+    w->choice[i] = -1;
+    for (int k = 0; k < scene->count; k++) {
+        float d = disti_ball_distance(&scene->ball[k], p);
+        if (!(d < least) || d >= scene->ball[k].margin || d < after || (d <= after && k <= last)) continue;
+        w->choice[i] = k;
+        w->lower[i] = least = d;
+    }
+}
+
+/* The least of what is known without a query, and the first instance to ask. Returns whether there may be a second. */
+static int disti_scene_begin(const dist_scene *scene, const float *p, disti_scene_work *w, size_t i)
+{
+    float best = 3e38f, first = 3e38f, second = 3e38f;
+    w->choice[i] = -1;
+    w->winner[i] = 0;
+    w->asked[i] = 0;
+    for (int k = 0; k < scene->count; k++) {
+        float d = disti_ball_distance(&scene->ball[k], p);
+        if (d >= scene->ball[k].margin) {
+            if (d >= best) continue;
+            best = d;
+            w->winner[i] = k;
+        } else if (d < first) {
+            second = first;
+            first = d;
+            w->choice[i] = k;
+        } else if (d < second) {
+            second = d;
+        }
+    }
+    w->best[i] = disti_finite_all(3, p) ? best : p[0] + p[1] + p[2]; /* not finite either */
+    w->lower[i] = first;
+    if (first >= best || !disti_finite_all(3, p)) w->choice[i] = -1;
+    return w->choice[i] >= 0 && second < best;
+}
+
+/* Puts the points in order of the instance that they ask, and what they ask into local. */
+static void disti_scene_sort(const dist_scene *scene, size_t n, const float *points, disti_scene_work *w)
+{
+    memset(w->start, 0, ((size_t)scene->count + 1) * sizeof(int));
+    for (size_t i = 0; i < n; i++)
+        if (w->choice[i] >= 0) w->start[w->choice[i] + 1]++;
+    for (int k = 0; k < scene->count; k++) w->start[k + 1] += w->start[k];
+    for (size_t i = 0; i < n; i++) {
+        if (w->choice[i] < 0) continue;
+        const disti_placed *placed = &scene->placed[w->choice[i]];
+        float q[3], normal[3];
+        float d = disti_placed_local(placed, points + 3 * i, q, normal);
+        size_t to = (size_t)w->start[w->choice[i]]++;
+        w->order[to] = (int)i;
+        for (size_t axis = 0; axis < 3; axis++)
+            w->local[3 * to + axis] =
+                d > 0.0f ? placed->field.center[axis] + placed->field.radius * normal[axis] : q[axis];
+    }
+    for (int k = scene->count; k > 0; k--) w->start[k] = w->start[k - 1];
+    w->start[0] = 0;
+}
+
+/* Asks until no instance is left that may hold a point's minimum. */
+static void disti_scene_rounds(const dist_scene *scene, int worker, size_t n, const float *points, disti_scene_work *w)
+{
+    for (;;) {
+        disti_scene_sort(scene, n, points, w);
+        size_t total = (size_t)w->start[scene->count];
+        if (total == 0) return;
+        *w->queries += total;
+        for (int k = 0; k < scene->count; k++) {
+            const dist_field *field = &scene->placed[k].field;
+            size_t first = (size_t)w->start[k], count = (size_t)w->start[k + 1] - first;
+            if (count > 0)
+                field->eval_fn(field->user, worker, count, w->local + 3 * first, w->value + first, NULL);
+        }
+        for (size_t at = 0; at < total; at++) {
+            size_t i = (size_t)w->order[at];
+            const float *p = points + 3 * i;
+            float f = disti_placed_value(&scene->placed[w->choice[i]], p, w->value[at], NULL, NULL, NULL);
+            if (!disti_finite(f) || f < w->best[i]) {
+                w->best[i] = f;
+                w->winner[i] = w->choice[i];
+                w->asked[i] = 1;
+            }
+            if (disti_finite(f)) disti_scene_next(scene, p, w, i);
+            else w->choice[i] = -1;
+        }
+    }
+}
+
+/* Finds what each point has to ask: everything in rounds (all: best is then f), or only where several instances may
+   hold the minimum; those are left with the one that does, or none if it is a sphere. */
+static void disti_scene_settle(const dist_scene *scene, int worker, size_t n, const float *points, disti_scene_work *w,
+                               int all)
+{
+    for (size_t i = 0; i < n; i++) {
+        int contested = disti_scene_begin(scene, points + 3 * i, w, i);
+        w->kept[i] = all || contested ? -2 : w->choice[i];
+        if (w->kept[i] != -2) w->choice[i] = -1;
+    }
+    disti_scene_rounds(scene, worker, n, points, w);
+    for (size_t i = 0; i < n && !all; i++) {
+        if (w->kept[i] == -2 && w->asked[i]) {
+            w->choice[i] = w->winner[i];
+            w->best[i] = 3e38f;
+        } else {
+            w->choice[i] = w->kept[i] == -2 ? -1 : w->kept[i];
+        }
+    }
+}
+
+/* What a group of a chunk's points needs to turn its field's answers into the scene's. */
+typedef struct disti_scene_link {
+    const dist_scene *scene;
+    disti_scene_work *work;
+    const float *points;
+    size_t at, group; /* the chunk's first point, the group's first place in order */
+    float *sdf, *gradient;
+    dist_seed_fn seed_fn;
+    void *seed_user;
+    double *d_code;
+} disti_scene_link;
+
+/* Point i of the chunk is finished: value and gradient out, the seed in, the placement's share added. Returns the
+   seed. */
+static float disti_scene_emit(const disti_scene_link *link, size_t i, int instance, float value, const float *gradient)
+{
+    const disti_placed *placed = &link->scene->placed[instance];
+    const float *p = link->points + 3 * i;
+    float seed = 0.0f;
+    if (link->sdf) link->sdf[i] = value;
+    if (link->gradient) memcpy(link->gradient + 3 * i, gradient, 3 * sizeof(float));
+    if (!link->seed_fn) return 0.0f;
+    link->seed_fn(link->seed_user, link->at + i, 1, &value, gradient, &seed);
+    if (!link->d_code || seed == 0.0f) return seed;
+    double g[3], r[3], torque[3], *d = link->d_code + placed->offset + placed->code;
+    for (int k = 0; k < 3; k++) {
+        g[k] = (double)seed * (double)gradient[k];
+        r[k] = (double)p[k] - (double)placed->translation[k];
+    }
+    disti_cross(g, r, torque);
+    d[0] += (double)seed * (double)value - disti_dot(g, r);
+    for (int k = 0; k < 3; k++) {
+        d[1 + k] += torque[k];
+        d[4 + k] -= g[k];
+    }
+    return seed;
+}
+
+/* A point whose minimum is the distance to a sphere. */
+static void disti_scene_emit_ball(const disti_scene_link *link, size_t i)
+{
+    int k = link->work->winner[i];
+    const disti_ball *ball = &link->scene->ball[k];
+    const float *p = link->points + 3 * i;
+    float n[3] = {p[0] - ball->center[0], p[1] - ball->center[1], p[2] - ball->center[2]};
+    float length = disti_length(n[0], n[1], n[2]);
+    for (int axis = 0; axis < 3; axis++) n[axis] /= length;
+    disti_scene_emit(link, i, k, link->work->best[i], n);
+}
+
+/* dist_seed_fn of a group: f and g of its field's answers. */
+static void disti_scene_seed(void *user, size_t first, size_t count, const float *sdf, const float *gradient,
+                             float *d_sdf)
+{
+    const disti_scene_link *link = (const disti_scene_link *)user;
+    const disti_scene_work *w = link->work;
+    for (size_t j = 0; j < count; j++) {
+        size_t i = (size_t)w->order[link->group + first + j];
+        float g[3], weight;
+        float f = disti_placed_value(&link->scene->placed[w->choice[i]], link->points + 3 * i, sdf[j],
+                                     gradient + 3 * j, g, &weight);
+        d_sdf[j] = 0.0f;
+        if (disti_finite(f) && f >= w->best[i]) disti_scene_emit_ball(link, i);
+        else d_sdf[j] = weight * disti_scene_emit(link, i, w->choice[i], f, g);
+    }
+}
+
+/* dist_field.fused_fn of a scene. Values alone are settled in rounds. With gradients or seeds only the points that
+   several instances may hold are; then each point asks one instance, in that field's own fused pass. */
+static void disti_scene_fused(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient,
+                              dist_seed_fn seed_fn, void *seed_user, double *d_code)
+{
+    const dist_scene *scene = (const dist_scene *)user;
+    disti_scene_work w;
+    disti_scene_layout(scene, scene->scratch + scene->scratch_bytes * (size_t)worker, &w);
+    disti_scene_link link;
+    link.scene = scene;
+    link.work = &w;
+    link.seed_fn = seed_fn;
+    link.seed_user = seed_user;
+    link.d_code = d_code;
+    for (size_t at = 0; at < n; at += DISTI_SCENE_CHUNK) {
+        size_t count = DISTI_MIN(n - at, (size_t)DISTI_SCENE_CHUNK);
+        int plain = !gradient && !seed_fn;
+        link.at = at;
+        link.points = points + 3 * at;
+        link.sdf = sdf ? sdf + at : NULL;
+        link.gradient = gradient ? gradient + 3 * at : NULL;
+        disti_scene_settle(scene, worker, count, link.points, &w, plain);
+        if (plain) {
+            if (sdf) memcpy(sdf + at, w.best, count * sizeof(float));
+            continue;
+        }
+        disti_scene_sort(scene, count, link.points, &w);
+        *w.queries += (unsigned long long)w.start[scene->count];
+        for (size_t i = 0; i < count; i++)
+            if (w.choice[i] < 0) disti_scene_emit_ball(&link, i);
+        for (int k = 0; k < scene->count; k++) {
+            const disti_placed *placed = &scene->placed[k];
+            link.group = (size_t)w.start[k];
+            size_t asked = (size_t)w.start[k + 1] - link.group;
+            if (asked > 0)
+                disti_field_fused(&placed->field, worker, asked, w.local + 3 * link.group, disti_scene_seed, &link,
+                                  d_code && placed->code > 0 ? d_code + placed->offset : NULL);
+        }
+    }
+}
+
+static void disti_scene_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    disti_scene_fused(user, worker, n, points, sdf, gradient, NULL, NULL, NULL);
+}
+
+/* The color of the instance whose surface is nearest. */
+static void disti_scene_color(void *user, int worker, size_t n, const float *points, float *color)
+{
+    const dist_scene *scene = (const dist_scene *)user;
+    disti_scene_work w;
+    disti_scene_layout(scene, scene->scratch + scene->scratch_bytes * (size_t)worker, &w);
+    for (size_t at = 0; at < n; at += DISTI_SCENE_CHUNK) {
+        size_t count = DISTI_MIN(n - at, (size_t)DISTI_SCENE_CHUNK);
+        disti_scene_settle(scene, worker, count, points + 3 * at, &w, 0);
+        for (size_t i = 0; i < count; i++)
+            if (w.choice[i] < 0) w.choice[i] = w.winner[i];
+        disti_scene_sort(scene, count, points + 3 * at, &w);
+        for (int k = 0; k < scene->count; k++) {
+            const dist_field *field = &scene->placed[k].field;
+            size_t first = (size_t)w.start[k], asked = (size_t)w.start[k + 1] - first;
+            if (asked > 0)
+                field->color_fn(field->user, worker, asked, w.local + 3 * first, w.slope + 3 * first);
+        }
+        for (size_t j = 0; j < count; j++)
+            memcpy(color + 3 * (at + (size_t)w.order[j]), w.slope + 3 * j, 3 * sizeof(float));
+    }
+}
+
+/* Whether the field asks this scene, itself or through other scenes. */
+static int disti_scene_within(const dist_scene *scene, const dist_field *field)
+{
+    if (field->eval_fn != disti_scene_eval) return 0;
+    const dist_scene *other = (const dist_scene *)field->user;
+    if (other == scene) return 1;
+    for (int k = 0; k < other->count; k++)
+        if (disti_scene_within(scene, &other->placed[k].field)) return 1;
+    return 0;
+}
+
+static size_t disti_field_code(const dist_field *field)
+{
+    return field->adjoint_fn || field->fused_fn ? (size_t)field->code_size : 0;
+}
+
+/* Checks an instance and puts it in place k; create: there is none yet. */
+static dist_status disti_scene_place(dist_scene *scene, int k, const dist_instance *instance, int create,
+                                     const char *function)
+{
+    dist_context *ctx = scene->ctx;
+    disti_placed *placed = &scene->placed[k], next = *placed;
+    const dist_similarity *s = &instance->placement;
+    double m[9], determinant, square = 0.0;
+    if (create || instance->field) {
+        dist_status status = disti_field_check(ctx, instance->field, function);
+        if (status != DIST_OK) return status;
+        next.field = *instance->field;
+    }
+    if (!create && disti_field_code(&next.field) != placed->code)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.code_size is %d, must stay what it was: %d", function,
+                          (double)disti_field_code(&next.field), (double)placed->code);
+    if (!create && !next.field.color_fn != !placed->field.color_fn)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: an instance %s color cannot come in place of one %s", function, 0,
+                          0);
+    if (disti_scene_within(scene, &next.field))
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: the field is this scene's own", function, 0, 0);
+    if (!disti_finite(s->scale) || s->scale < 0.0f)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: placement.scale is %d, must be above 0 (0: 1)", function,
+                          (double)s->scale, 0);
+    if (!disti_finite_all(9, s->rotation) || !disti_finite_all(3, s->translation))
+        return disti_fail(ctx, DIST_NOT_FINITE, "%s: placement.rotation and translation must be finite", function, 0,
+                          0);
+    for (int i = 0; i < 9; i++) {
+        m[i] = (double)s->rotation[i];
+        square += m[i] * m[i];
+    }
+    if (square == 0.0) m[0] = m[4] = m[8] = 1.0;
+    double off = disti_rotation_off(m, &determinant);
+    if (off > 1e-3 || determinant < 0.0)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT,
+                          "%s: placement.rotation is not a rotation (rows off orthonormal by %d, determinant %d); see "
+                          "dist_similarity_move",
+                          function, off, determinant);
+    disti_orthonormalize(m);
+    next.scale = s->scale > 0.0f ? s->scale : 1.0f;
+    disti_ball ball;
+    for (int i = 0; i < 3; i++) {
+        const float *c = next.field.center;
+        double x = m[3 * i] * (double)c[0] + m[3 * i + 1] * (double)c[1] + m[3 * i + 2] * (double)c[2];
+        ball.center[i] = (float)((double)next.scale * x + (double)s->translation[i]);
+    }
+    for (int i = 0; i < 9; i++) next.rotation[i] = (float)m[i];
+    memcpy(next.translation, s->translation, sizeof next.translation);
+    ball.radius = next.scale * next.field.radius;
+    ball.margin = 0.2f * ball.radius;
+    if (!disti_finite_all(3, ball.center) || !disti_finite(ball.radius) || !(ball.radius > 0.0f))
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: placement.scale is %d: the bounding sphere does not fit a float",
+                          function, (double)next.scale, 0);
+    *placed = next;
+    scene->ball[k] = ball;
+    return DIST_OK;
+}
+
+DIST_API dist_status dist_scene_set(dist_scene *scene, int index, const dist_instance *instance)
+{
+    if (!scene) return DIST_BAD_ARGUMENT;
+    if (!instance || index < 0 || index >= scene->count)
+        return disti_fail(scene->ctx, DIST_BAD_ARGUMENT,
+                          "dist_scene_set: index is %d of %d instances; instance must not be NULL", NULL, index,
+                          scene->count);
+    return disti_scene_place(scene, index, instance, 0, "dist_scene_set");
+}
+
+DIST_API void dist_scene_destroy(dist_scene *scene)
+{
+    if (!scene) return;
+    size_t count = (size_t)scene->count;
+    disti_free(scene->ctx, scene->scratch, scene->scratch_bytes * (size_t)scene->ctx->workers);
+    disti_free(scene->ctx, scene->ball, count * sizeof(disti_ball));
+    disti_free(scene->ctx, scene->placed, count * sizeof(disti_placed));
+    disti_free(scene->ctx, scene, sizeof *scene);
+}
+
+DIST_API dist_scene *dist_scene_create(dist_context *ctx, int count, const dist_instance *instances)
+{
+    const char *name = "dist_scene_create";
+    disti_scene_work w;
+    size_t lanes;
+    if (disti_enter(ctx, name) != DIST_OK) return NULL;
+    if (count < 1 || count > 1 << 20 || !instances) {
+        disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: count is %d, must be 1 to 2^20, and instances not NULL", name, count, 0);
+        return NULL;
+    }
+    dist_scene *scene = (dist_scene *)disti_alloc(ctx, sizeof(dist_scene));
+    if (!scene) return NULL;
+    memset(scene, 0, sizeof *scene);
+    scene->ctx = ctx;
+    scene->count = count;
+    scene->scratch_bytes = disti_scene_layout(scene, NULL, &w);
+    if (!disti_size_mul(scene->scratch_bytes, (size_t)ctx->workers, &lanes)) lanes = (size_t)-1;
+    scene->placed = (disti_placed *)disti_alloc(ctx, (size_t)count * sizeof(disti_placed));
+    scene->ball = scene->placed ? (disti_ball *)disti_alloc(ctx, (size_t)count * sizeof(disti_ball)) : NULL;
+    scene->scratch = scene->ball ? (unsigned char *)disti_alloc(ctx, lanes) : NULL;
+    if (!scene->scratch) goto fail;
+    memset(scene->scratch, 0, lanes);
+    memset(scene->placed, 0, (size_t)count * sizeof(disti_placed));
+    for (int k = 0; k < count; k++) {
+        disti_placed *placed = &scene->placed[k];
+        if (disti_scene_place(scene, k, &instances[k], 1, name) != DIST_OK) goto fail;
+        placed->code = disti_field_code(&placed->field);
+        placed->offset = scene->code_size;
+        scene->code_size += placed->code + 7;
+        if (scene->code_size > 0x7fffffffu) {
+            disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: all codes together have more than 2^31 numbers", name, 0, 0);
+            goto fail;
+        }
+    }
+    if (disti_partial_reserve(ctx, scene->code_size + scene->code_size / DISTI_SLOTS + 1) != DIST_OK) goto fail;
+    return scene;
+fail:
+    dist_scene_destroy(scene);
+    return NULL;
+}
+
+/* The smallest sphere around the instances' spheres, nearly: from the middle toward the farthest, less each time
+   (Badoiu and Clarkson 2003); the best center is kept. */
+static float disti_scene_bound(const dist_scene *scene, float center[3])
+{
+    double c[3] = {0.0, 0.0, 0.0}, least = 1e300;
+    for (int k = 0; k < scene->count; k++)
+        for (int i = 0; i < 3; i++) c[i] += (double)scene->ball[k].center[i] / scene->count;
+    for (int round = 2; round < 66; round++) {
+        double most = -1.0, to[3] = {0.0, 0.0, 0.0};
+        for (int k = 0; k < scene->count; k++) {
+            double d[3], r = (double)scene->ball[k].radius;
+            for (int i = 0; i < 3; i++) d[i] = (double)scene->ball[k].center[i] - c[i];
+            double length = sqrt(disti_dot(d, d));
+            if (length + r <= most) continue;
+            most = length + r;
+            for (int i = 0; i < 3; i++) to[i] = length > 0.0 ? d[i] * most / length : 0.0;
+        }
+        if (most < least) {
+            least = most;
+            for (int i = 0; i < 3; i++) center[i] = (float)c[i];
+        }
+        for (int i = 0; i < 3; i++) c[i] += to[i] / round;
+    }
+    return (float)(scene->count > 1 ? least * (1.0 + 1e-6) : least);
+}
+
+DIST_API dist_field dist_scene_field(dist_scene *scene)
+{
+    dist_field field;
+    memset(&field, 0, sizeof field);
+    if (!scene) return field;
+    field.user = scene;
+    field.owner = scene->ctx;
+    field.eval_fn = disti_scene_eval;
+    field.fused_fn = disti_scene_fused;
+    field.color_fn = disti_scene_color;
+    field.code_size = (int)scene->code_size;
+    field.lipschitz = 1.0f;
+    field.radius = disti_scene_bound(scene, field.center);
+    for (int k = 0; k < scene->count; k++) {
+        const dist_field *f = &scene->placed[k].field;
+        float clamp = f->clamp * scene->placed[k].scale;
+        field.lipschitz = DISTI_MAX(field.lipschitz, f->lipschitz);
+        if (clamp > 0.0f && !(field.clamp > 0.0f && field.clamp < clamp)) field.clamp = clamp;
+        if (!f->color_fn) field.color_fn = NULL;
+    }
+    return field;
+}
+
+DIST_API int dist_scene_offset(const dist_scene *scene, int index)
+{
+    if (!scene || index < 0 || index > scene->count) return -1;
+    return (int)(index < scene->count ? scene->placed[index].offset : scene->code_size);
+}
+
+DIST_API unsigned long long dist_scene_queries(const dist_scene *scene)
+{
+    disti_scene_work w;
+    unsigned long long sum = 0;
+    for (int worker = 0; scene && worker < scene->ctx->workers; worker++) {
+        disti_scene_layout(scene, scene->scratch + scene->scratch_bytes * (size_t)worker, &w);
+        sum += *w.queries;
+    }
+    return sum;
+}
+
+typedef struct disti_scene_job {
+    const dist_scene *scene;
+    disti_pieces pieces;
+    const float *points;
+    int *index;
+} disti_scene_job;
+
+static void disti_scene_find_task(void *arg, int index, int worker)
+{
+    const disti_scene_job *job = (const disti_scene_job *)arg;
+    const dist_scene *scene = job->scene;
+    disti_scene_work w;
+    size_t first = (size_t)index * job->pieces.size, end = DISTI_MIN(first + job->pieces.size, job->pieces.n);
+    disti_scene_layout(scene, scene->scratch + scene->scratch_bytes * (size_t)worker, &w);
+    for (size_t count = 0; first < end; first += count) {
+        count = DISTI_MIN(end - first, (size_t)DISTI_SCENE_CHUNK);
+        disti_scene_settle(scene, worker, count, job->points + 3 * first, &w, 1);
+        memcpy(job->index + first, w.winner, count * sizeof(int));
+    }
+}
+
+DIST_API dist_status dist_scene_find(dist_scene *scene, size_t n, const float *points, int *index)
+{
+    disti_scene_job job;
+    if (!scene) return DIST_BAD_ARGUMENT;
+    if (n == 0) return DIST_OK;
+    if (!points || !index)
+        return disti_fail(scene->ctx, DIST_BAD_ARGUMENT, "dist_scene_find: %s is NULL", points ? "index" : "points", 0,
+                          0);
+    job.scene = scene;
+    job.pieces = disti_cut(n, DISTI_SCENE_CHUNK, 1u << 20);
+    job.points = points;
+    job.index = index;
+    disti_run(scene->ctx, job.pieces.count, disti_scene_find_task, &job);
+    return DIST_OK;
+}
+
+DIST_API void dist_similarity_move(dist_similarity *placement, const float step[7])
+{
+    float zero[9] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
+    if (!placement || !step) return;
+    if (placement->scale == 0.0f) placement->scale = 1.0f;
+    if (memcmp(placement->rotation, zero, sizeof zero) == 0)
+        placement->rotation[0] = placement->rotation[4] = placement->rotation[8] = 1.0f;
+    placement->scale *= expf(step[0]);
+    disti_turn(step + 1, placement->rotation);
+    for (int i = 0; i < 3; i++) placement->translation[i] += step[4 + i];
+}
+
 /*@ 05 net ---------------------------------------------------------------------------------------------------------- */
 
 /* The container of a model: safetensors. Eight bytes give the header's length (little-endian), the header is a JSON
@@ -5629,20 +6306,14 @@ static dist_status disti_camera_check(dist_context *ctx, const dist_camera *came
                           0);
     if (!disti_finite_all(9, camera->rotation) || !disti_finite_all(3, camera->translation))
         return disti_fail(ctx, DIST_NOT_FINITE, "%s: camera.rotation and translation must be finite", function, 0, 0);
-    double m[9], c[3], worst = 0.0;
+    double m[9], determinant;
     for (int i = 0; i < 9; i++) m[i] = (double)camera->rotation[i];
-    for (int i = 0; i < 3; i++) {
-        for (int j = i; j < 3; j++) {
-            double d = disti_dot(m + 3 * i, m + 3 * j) - (i == j ? 1.0 : 0.0);
-            worst = DISTI_MAX(worst, d < 0.0 ? -d : d);
-        }
-    }
-    disti_cross(m, m + 3, c);
-    if (worst > 1e-3 || disti_dot(c, m + 6) < 0.0)
+    double off = disti_rotation_off(m, &determinant);
+    if (off > 1e-3 || determinant < 0.0)
         return disti_fail(
             ctx, DIST_BAD_ARGUMENT,
             "%s: camera.rotation is not a rotation (rows off orthonormal by %d, determinant %d); see dist_camera_move",
-            function, worst, disti_dot(c, m + 6));
+            function, off, determinant);
     return DIST_OK;
 }
 

@@ -1,0 +1,1083 @@
+/* SPDX-License-Identifier: MIT-0
+   test_scene.c - several placed fields as one: values, gradients for every code and placement, pictures, fits, queries;
+   against the definition worked out in double without leaving anything out. */
+#include "test.h"
+
+#include "model.h"
+
+enum { SPHERE, TORUS, BOX, NET, KINDS };
+enum { PARTS = 24, NUMBERS = 24 };
+
+/* An instance in double, and its float twin. */
+typedef struct part {
+    int kind, code_size;
+    const model *m;
+    double code[MODEL_CODE], scale, rotation[9], translation[3], radius;
+    float codef[MODEL_CODE];
+    dist_field field;
+    dist_similarity placement;
+    dist_shape *shape;
+} part;
+
+typedef struct world {
+    int count;
+    part part[PARTS];
+    dist_context *ctx;
+    dist_scene *scene;
+    dist_field field;
+} world;
+
+static double part_inner(const part *a, const double q[3])
+{
+    const double *c = a->code;
+    if (a->kind == NET) return model_eval(a->m, a->m->params, c, q);
+    double x[3] = {q[0] - c[0], q[1] - c[1], q[2] - c[2]};
+    if (a->kind == SPHERE) return sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2]) - c[3];
+    if (a->kind == TORUS) {
+        double h = sqrt(x[0] * x[0] + x[2] * x[2]) - c[3];
+        return sqrt(h * h + x[1] * x[1]) - c[4];
+    }
+    double outside = 0, most = -1e300;
+    for (int i = 0; i < 3; i++) {
+        double e = fabs(x[i]) - c[3 + i];
+        outside += e > 0 ? e * e : 0;
+        most = fmax(most, e);
+    }
+    return sqrt(outside) + fmin(most, 0);
+}
+
+/* f_i at p. margin: NULL, or made smaller where a kink is nearer: of d, of b against its cap, of ReLUs and the box.
+   capped 0: the lower bound goes on without a cap, as nobody computes it. */
+static double part_value(const part *a, const double p[3], int capped, double *margin)
+{
+    double x[3], q[3], n[3], length = 0, r = a->radius, m = 0.2 * r, closest = 1e300;
+    for (int i = 0; i < 3; i++) x[i] = (p[i] - a->translation[i]) / a->scale;
+    for (int i = 0; i < 3; i++) {
+        q[i] = a->rotation[i] * x[0] + a->rotation[3 + i] * x[1] + a->rotation[6 + i] * x[2];
+        n[i] = q[i] - (double)a->field.center[i];
+        length += n[i] * n[i];
+    }
+    length = sqrt(length);
+    double d = length - r, b;
+    for (int i = 0; i < 3 && d > 0; i++) q[i] = (double)a->field.center[i] + r * n[i] / length;
+    b = part_inner(a, q);
+    if (margin && a->kind == NET) model_channels(a->m, a->m->params, a->code, q, NULL, NULL, &closest);
+    if (margin && a->kind == BOX)
+        for (int i = 0; i < 3; i++) closest = fmin(closest, fabs(fabs(q[i] - a->code[i]) - a->code[3 + i]));
+    if (margin) *margin = fmin(*margin, fmin(closest, fabs(d)));
+    if (d > 0) {
+        if (margin) *margin = fmin(*margin, fabs(b));
+        b = sqrt(d * d + fmax(b, 0) * fmax(b, 0));
+    }
+    double cap = m + fabs(d - m);
+    if (margin && d < m) *margin = fmin(*margin, fabs(b - cap));
+    if (margin) *margin = fmin(*margin, fabs(d - m));
+    return a->scale * (capped ? fmin(b, cap) : b);
+}
+
+static double world_value(const world *w, const double p[3], int capped, int *nearest, double *margin)
+{
+    double best = 1e300, second = 1e300;
+    if (margin) *margin = 1e300;
+    for (int k = 0; k < w->count; k++) {
+        double f = part_value(&w->part[k], p, capped, margin);
+        if (f < best) {
+            second = best;
+            best = f;
+            if (nearest) *nearest = k;
+        } else {
+            second = fmin(second, f);
+        }
+    }
+    if (margin) *margin = fmin(*margin, second - best);
+    return best;
+}
+
+/* exp([w]x) m, scale and translation, in double. */
+static void part_move(part *a, int number, double by)
+{
+    if (number == 0) a->scale *= exp(by);
+    if (number > 3) a->translation[number - 4] += by;
+    if (number < 1 || number > 3) return;
+    int i = number % 3, j = (number + 1) % 3; /* the axes that turn into each other: around x: y into z */
+    for (int k = 0; k < 3; k++) {
+        double x = a->rotation[3 * i + k], y = a->rotation[3 * j + k];
+        a->rotation[3 * i + k] = cos(by) * x - sin(by) * y;
+        a->rotation[3 * j + k] = sin(by) * x + cos(by) * y;
+    }
+}
+
+static void part_number(part *a, int number, double by)
+{
+    if (number < a->code_size) a->code[number] += by;
+    else part_move(a, number - a->code_size, by);
+}
+
+static part part_make(dist_context *ctx, int kind, const model *m, const dist_net *net, test_random *random)
+{
+    static const float codes[3][6] = {
+        {0.1f, -0.05f, 0.05f, 0.6f}, {0.05f, 0.02f, -0.04f, 0.55f, 0.2f}, {0.05f, -0.05f, 0.02f, 0.5f, 0.35f, 0.45f}};
+    part a;
+    memset(&a, 0, sizeof a);
+    a.kind = kind;
+    a.m = m;
+    a.code_size = kind == NET ? m->desc.code_size : 4 + kind;
+    for (int i = 0; i < a.code_size; i++) {
+        a.codef[i] = kind == NET ? test_random_float(random, 0.2f, 0.3f) : codes[kind][i];
+        a.code[i] = (double)a.codef[i];
+    }
+    if (kind == NET) a.shape = dist_shape_create(ctx, net, a.codef);
+    return a;
+}
+
+/* After the part has come to stay where it is: fields borrow codef. */
+static void part_finish(part *a)
+{
+    a->field = a->kind == NET      ? dist_shape_field(a->shape)
+               : a->kind == SPHERE ? dist_field_sphere(a->codef)
+               : a->kind == TORUS  ? dist_field_torus(a->codef)
+                                   : dist_field_box(a->codef);
+    a->radius = (double)a->field.radius;
+    a->scale = (double)a->placement.scale;
+    for (int i = 0; i < 9; i++) a->rotation[i] = (double)a->placement.rotation[i];
+    for (int i = 0; i < 3; i++) a->translation[i] = (double)a->placement.translation[i];
+}
+
+static void part_place(part *a, float scale, test_random *random, float x, float y, float z)
+{
+    float step[7] = {logf(scale), 0, 0, 0, x, y, z};
+    test_random_fill(random, 3, step + 1, -1.5f, 1.5f);
+    dist_similarity_move(&a->placement, step);
+}
+
+static void world_open(world *w)
+{
+    dist_instance instances[PARTS];
+    memset(instances, 0, sizeof instances);
+    for (int k = 0; k < w->count; k++) {
+        part_finish(&w->part[k]);
+        instances[k].field = &w->part[k].field;
+        instances[k].placement = w->part[k].placement;
+    }
+    w->scene = dist_scene_create(w->ctx, w->count, instances);
+    w->field = dist_scene_field(w->scene);
+}
+
+static void world_close(world *w)
+{
+    dist_scene_destroy(w->scene);
+    for (int k = 0; k < w->count; k++) dist_shape_destroy(w->part[k].shape);
+}
+
+static const model_desc nets[] = {
+    {.name = "relu", .code_size = 2, .width = 16, .clamp = 0.3},
+    {.name = "elu with skip", .code_size = 3, .activation = DIST_ACTIVATION_ELU, .skip = 4, .output = MODEL_NONE},
+    {.name = "softplus", .code_size = 2, .activation = DIST_ACTIVATION_SOFTPLUS, .first_scale = 4.0},
+    {.name = "sine",
+     .code_size = 2,
+     .activation = DIST_ACTIVATION_SINE,
+     .first_scale = 4.0,
+     .scale = 1.5,
+     .output = MODEL_NONE},
+    {.name = "tanh", .code_size = 3, .activation = DIST_ACTIVATION_TANH, .clamp = 0.3},
+    {.name = "none with fourier",
+     .code_size = 2,
+     .activation = DIST_ACTIVATION_NONE,
+     .fourier = 1,
+     .levels = 1,
+     .base = 1.5}};
+
+enum { NETS = sizeof nets / sizeof nets[0] };
+
+/* One net of each activation between the three analytic fields; near[0] and [1] overlap. */
+typedef struct mixture {
+    world w;
+    model m;
+    dist_net *net;
+} mixture;
+
+static void mixture_open(mixture *x, int which, dist_context *ctx)
+{
+    test_random random = test_random_seed(100 + (unsigned)which);
+    memset(x, 0, sizeof *x);
+    x->m = model_make(&nets[which], 40 + (unsigned)which);
+    part *parts = x->w.part;
+    double code[MODEL_CODE];
+    for (int i = 0; i < MODEL_CODE; i++) code[i] = 0.25;
+    model_fit_ball(&x->m, code, 0.6);
+    x->w.ctx = ctx;
+    x->net = model_load(ctx, &x->m);
+    x->w.count = 4;
+    for (int k = 0; k < 4; k++) parts[k] = part_make(ctx, k == 3 ? NET : k, &x->m, x->net, &random);
+    part_place(&parts[0], 0.7f, &random, -0.5f, 0.1f, 0.0f);
+    part_place(&parts[1], 1.3f, &random, 0.5f, -0.2f, 0.2f);
+    part_place(&parts[2], 0.5f, &random, 0.2f, 1.6f, -0.1f);
+    part_place(&parts[3], 0.8f, &random, -1.3f, -1.2f, 0.3f);
+    world_open(&x->w);
+}
+
+static void mixture_close(mixture *x)
+{
+    world_close(&x->w);
+    dist_net_destroy(x->net);
+    model_free(&x->m);
+}
+
+static void random_points(test_random *random, int n, double size, float *points)
+{
+    for (int i = 0; i < 3 * n; i++) points[i] = test_random_float(random, (float)-size, (float)size);
+}
+
+/* Within `reach` radii of the instances' centers. */
+static void near_points(test_random *random, const world *w, int n, double reach, float *points)
+{
+    for (int i = 0; i < n; i++) {
+        const disti_ball *ball = &w->scene->ball[i % w->count];
+        float u[3], r = ball->radius * test_random_float(random, 0, (float)reach);
+        test_random_direction(random, u);
+        for (int k = 0; k < 3; k++) points[3 * i + k] = ball->center[k] + r * u[k];
+    }
+}
+
+static void point_of(const float *points, int i, double p[3])
+{
+    for (int k = 0; k < 3; k++) p[k] = (double)points[3 * i + k];
+}
+
+TEST(a_scene_is_the_least_of_its_placed_fields)
+{
+    enum { N = 3000 };
+    static float points[3 * N], sdf[N], again[N], gradient[3 * N];
+    static int index[N];
+    dist_context *ctx = test_context();
+    for (int which = 0; which < NETS; which++) {
+        mixture x;
+        test_random random = test_random_seed(7);
+        int judged = 0, other = 0, exact = 0;
+        double worst = 0, worst_exact = 0;
+        mixture_open(&x, which, ctx);
+        random_points(&random, N / 2, 3.0, points);
+        near_points(&random, &x.w, N / 2, 1.3, points + 3 * (N / 2));
+        CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &x.w.field, N, points, sdf, NULL), ctx);
+        CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &x.w.field, N, points, again, gradient), ctx);
+        CHECK_STATUS(DIST_OK, dist_scene_find(x.w.scene, N, points, index), ctx);
+        for (int i = 0; i < N; i++) {
+            double p[3], margin;
+            int nearest = -1;
+            point_of(points, i, p);
+            double f = world_value(&x.w, p, 1, &nearest, &margin), union_f = world_value(&x.w, p, 0, NULL, NULL);
+            worst = fmax(worst, fmax(fabs(f - (double)sdf[i]), fabs(f - (double)again[i])));
+            CHECK(f <= union_f + 1e-12);
+            other += margin > 1e-4 && index[i] != nearest;
+            judged++;
+            if (f >= 0.15 * x.w.part[2].scale * x.w.part[2].radius) continue; /* below every fifth of a radius */
+            exact++;
+            worst_exact = fmax(worst_exact, fabs(union_f - (double)sdf[i]));
+        }
+        CHECK_NEAR(0, worst, 3e-6);
+        CHECK_NEAR(0, worst_exact, 3e-6);
+        CHECK_EQUAL(0, other);
+        CHECK(exact > 400);
+        mixture_close(&x);
+    }
+    dist_context_destroy(ctx);
+}
+
+/* Nothing is asked outside its own sphere. */
+typedef struct watched {
+    float numbers[4];
+    double farthest;
+} watched;
+
+static void watched_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    watched *x = (watched *)user;
+    for (size_t i = 0; i < n; i++) {
+        double p[3] = {(double)points[3 * i], (double)points[3 * i + 1], (double)points[3 * i + 2]};
+        x->farthest = fmax(x->farthest, sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2]));
+    }
+    disti_sphere_eval(x->numbers, worker, n, points, sdf, gradient);
+}
+
+TEST(no_field_is_asked_outside_its_sphere)
+{
+    enum { N = 4000 };
+    static float points[3 * N], sdf[N], gradient[3 * N];
+    watched x = {{0, 0, 0, 0.5f}, 0};
+    dist_context *ctx = test_context();
+    dist_field field = dist_field_sphere(x.numbers);
+    dist_instance instances[2];
+    test_random random = test_random_seed(5);
+    field.user = &x;
+    field.eval_fn = watched_eval;
+    field.radius = 0.8f;
+    memset(instances, 0, sizeof instances);
+    instances[0].field = instances[1].field = &field;
+    instances[0].placement.scale = 0.25f;
+    instances[0].placement.translation[0] = 3.0f;
+    dist_scene *scene = dist_scene_create(ctx, 2, instances);
+    dist_field all = dist_scene_field(scene);
+    random_points(&random, N, 4.0, points);
+    CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &all, N, points, sdf, gradient), ctx);
+    CHECK(x.farthest > 0.79);
+    CHECK(x.farthest <= 0.8 * (1 + 3e-7));
+    dist_scene_destroy(scene);
+    dist_context_destroy(ctx);
+}
+
+/* The formulas of the adjoint in double: 1e-6. */
+TEST(the_adjoint_of_a_placement_is_its_derivative_in_double)
+{
+    dist_context *ctx = test_context();
+    mixture x;
+    test_random random = test_random_seed(11);
+    mixture_open(&x, 2, ctx);
+    int judged = 0;
+    for (int i = 0; i < 400; i++) {
+        double p[3], g[3], margin, expected[7], r[3];
+        int k = 0;
+        for (int axis = 0; axis < 3; axis++) p[axis] = test_random_double(&random, -2, 2);
+        double f = world_value(&x.w, p, 1, &k, &margin);
+        if (margin < 1e-4) continue;
+        for (int axis = 0; axis < 3; axis++) {
+            double a[3] = {p[0], p[1], p[2]}, b[3] = {p[0], p[1], p[2]};
+            a[axis] += 1e-5;
+            b[axis] -= 1e-5;
+            g[axis] = (world_value(&x.w, a, 1, NULL, NULL) - world_value(&x.w, b, 1, NULL, NULL)) / 2e-5;
+            r[axis] = p[axis] - x.w.part[k].translation[axis];
+        }
+        expected[0] = f - g[0] * r[0] - g[1] * r[1] - g[2] * r[2];
+        for (int axis = 0; axis < 3; axis++) {
+            int a = (axis + 1) % 3, b = (axis + 2) % 3;
+            expected[1 + axis] = g[a] * r[b] - g[b] * r[a];
+            expected[4 + axis] = -g[axis];
+        }
+        for (int number = 0; number < 7; number++) {
+            part keep = x.w.part[k];
+            part_move(&x.w.part[k], number, 1e-5);
+            double up = world_value(&x.w, p, 1, NULL, NULL);
+            x.w.part[k] = keep;
+            part_move(&x.w.part[k], number, -1e-5);
+            double down = world_value(&x.w, p, 1, NULL, NULL);
+            x.w.part[k] = keep;
+            CHECK_NEAR(expected[number], (up - down) / 2e-5, 1e-6);
+        }
+        judged++;
+    }
+    CHECK(judged > 360);
+    mixture_close(&x);
+    dist_context_destroy(ctx);
+}
+
+/* Value, gradient and adjoint of what the library computes, against differences of the definition in double. */
+TEST(gradients_for_points_codes_and_placements_are_those_of_double)
+{
+    enum { N = 500 };
+    static float points[3 * N], sdf[N], gradient[3 * N], seeds[N], d_points[3 * N], d_code[200];
+    dist_context *ctx = test_context();
+    for (int which = 0; which < NETS; which++) {
+        mixture x;
+        test_random random = test_random_seed(21 + (unsigned)which);
+        int n = 0, tried = 0;
+        float near[12];
+        mixture_open(&x, which, ctx);
+        while (n < N && tried < 20 * N) {
+            double p[3], margin;
+            if (tried++ % 4) near_points(&random, &x.w, 4, 1.2, near);
+            else random_points(&random, 4, 2.5, near);
+            memcpy(points + 3 * n, near + 3 * (tried / 4 % 4), 3 * sizeof(float));
+            point_of(points, n, p);
+            world_value(&x.w, p, 1, NULL, &margin);
+            n += margin > 1e-4;
+        }
+        CHECK_EQUAL(N, n);
+        CHECK(tried < N * 10 / 9); /* the rest was too near a kink */
+        for (int i = 0; i < N; i++) seeds[i] = test_random_float(&random, -1, 1);
+        memset(d_points, 0, sizeof d_points);
+        memset(d_code, 0, sizeof d_code);
+        dist_gradients grads;
+        memset(&grads, 0, sizeof grads);
+        grads.code = d_code;
+        CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &x.w.field, N, points, sdf, gradient), ctx);
+        CHECK_STATUS(DIST_OK, dist_field_backward(ctx, &x.w.field, N, points, seeds, NULL, NULL, d_points, &grads),
+                     ctx);
+        double worst = 0, worst_pull = 0;
+        for (int i = 0; i < N; i++)
+            for (int axis = 0; axis < 3; axis++) {
+                double a[3], b[3];
+                point_of(points, i, a);
+                point_of(points, i, b);
+                a[axis] += 1e-6;
+                b[axis] -= 1e-6;
+                double g = (world_value(&x.w, a, 1, NULL, NULL) - world_value(&x.w, b, 1, NULL, NULL)) / 2e-6;
+                worst = fmax(worst, fabs(g - (double)gradient[3 * i + axis]));
+                worst_pull = fmax(worst_pull, fabs(g * (double)seeds[i] - (double)d_points[3 * i + axis]));
+            }
+        CHECK_NEAR(0, worst, 1e-4);
+        CHECK_NEAR(0, worst_pull, 1e-4);
+        CHECK_EQUAL(x.w.field.code_size, dist_scene_offset(x.w.scene, x.w.count));
+        double largest = 0;
+        for (int j = 0; j < x.w.field.code_size; j++) largest = fmax(largest, fabs((double)d_code[j]));
+        for (int k = 0; k < x.w.count; k++) {
+            int first = dist_scene_offset(x.w.scene, k), size = dist_scene_offset(x.w.scene, k + 1) - first;
+            CHECK_EQUAL(x.w.part[k].code_size + 7, size);
+            for (int j = 0; j < size; j++) {
+                double sum = 0;
+                part keep = x.w.part[k];
+                for (int i = 0; i < N; i++) {
+                    double p[3];
+                    point_of(points, i, p);
+                    part_number(&x.w.part[k], j, 1e-6);
+                    double up = world_value(&x.w, p, 1, NULL, NULL);
+                    x.w.part[k] = keep;
+                    part_number(&x.w.part[k], j, -1e-6);
+                    sum += (double)seeds[i] * (up - world_value(&x.w, p, 1, NULL, NULL)) / 2e-6;
+                    x.w.part[k] = keep;
+                }
+                CHECK_NEAR(sum, d_code[first + j], 2e-4 * largest);
+            }
+        }
+        mixture_close(&x);
+    }
+    dist_context_destroy(ctx);
+}
+
+/* ---- pictures ---------------------------------------------------------------------------------------------------- */
+
+enum { SIDE = 96, PIXELS = SIDE * SIDE };
+
+typedef struct picture {
+    float depth[PIXELS], error[PIXELS], silhouette[PIXELS], normal[3 * PIXELS];
+    unsigned char mask[PIXELS], status[PIXELS];
+    dist_stats stats;
+} picture;
+
+static picture first, second;
+
+static dist_images planes_of(picture *p)
+{
+    dist_images out;
+    memset(&out, 0, sizeof out);
+    out.depth = p->depth;
+    out.error = p->error;
+    out.silhouette = p->silhouette;
+    out.normal = p->normal;
+    out.mask = p->mask;
+    out.status = p->status;
+    out.stats = &p->stats;
+    return out;
+}
+
+static dist_camera camera_for(const dist_field *field, int side)
+{
+    float up[3] = {0, 1, 0}, eye[3] = {field->center[0] + 1.3f * field->radius, field->center[1] + 0.9f * field->radius,
+                                       field->center[2] + 2.0f * field->radius};
+    return dist_camera_look_at(side, side, 0.8f, eye, field->center, up);
+}
+
+/* Pixels whose masks differ, or whose depths by more than both errors and float's rounding. */
+static int compare(const picture *a, const picture *b)
+{
+    int differ = 0;
+    for (int i = 0; i < PIXELS; i++) {
+        double off = fabs((double)a->depth[i] - (double)b->depth[i]);
+        double allowed = (double)a->error[i] + (double)b->error[i] + 3e-6 * (double)a->depth[i];
+        differ += a->mask[i] != b->mask[i] || (a->mask[i] && off > allowed);
+    }
+    return differ;
+}
+
+static int hits_of(const picture *p)
+{
+    int hits = 0;
+    for (int i = 0; i < PIXELS; i++) hits += p->mask[i];
+    return hits;
+}
+
+/* A field of one's own that asks every instance everywhere, in float. */
+static void union_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    const world *w = (const world *)user;
+    for (size_t i = 0; i < n; i++) {
+        float best = 3e38f;
+        for (int k = 0; k < w->count; k++) {
+            const part *a = &w->part[k];
+            float f, q[3], ask[3], normal[3], g[3], turned[3];
+            disti_placed placed;
+            memset(&placed, 0, sizeof placed);
+            placed.field = a->field;
+            placed.scale = a->placement.scale;
+            memcpy(placed.rotation, a->placement.rotation, sizeof placed.rotation);
+            memcpy(placed.translation, a->placement.translation, sizeof placed.translation);
+            float d = disti_placed_local(&placed, points + 3 * i, q, normal);
+            for (int axis = 0; axis < 3; axis++)
+                ask[axis] = d > 0.0f ? a->field.center[axis] + a->field.radius * normal[axis] : q[axis];
+            a->field.eval_fn(a->field.user, worker, 1, ask, &f, g);
+            for (int axis = 0; axis < 3; axis++)
+                turned[axis] = placed.rotation[3 * axis] * g[0] + placed.rotation[3 * axis + 1] * g[1] +
+                               placed.rotation[3 * axis + 2] * g[2];
+            f = placed.scale * (d > 0.0f ? sqrtf(d * d + fmaxf(f, 0.0f) * fmaxf(f, 0.0f)) : f);
+            if (f >= best) continue;
+            best = f;
+            if (gradient) memcpy(gradient + 3 * i, turned, sizeof turned);
+        }
+        sdf[i] = best;
+    }
+}
+
+TEST(a_scene_looks_like_the_union_that_asks_everything)
+{
+    dist_context *ctx = test_context();
+    for (int which = 0; which < (test_quick() ? 2 : NETS); which++) {
+        mixture x;
+        mixture_open(&x, which, ctx);
+        dist_field all = x.w.field;
+        all.user = &x.w;
+        all.eval_fn = union_eval;
+        all.fused_fn = NULL;
+        all.code_size = 0;
+        dist_camera camera = camera_for(&all, SIDE);
+        dist_images out = planes_of(&first), plain = planes_of(&second);
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &x.w.field, &camera, NULL, &out, NULL), ctx);
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &all, &camera, NULL, &plain, NULL), ctx);
+        int differ = compare(&first, &second), hits = hits_of(&first);
+        CHECK(hits > PIXELS / 20);
+        CHECK(differ <= hits / 100); /* grazing rays at edges, which either tracing may miss */
+        double off = 0;
+        for (int i = 0; i < PIXELS; i++) {
+            if (!first.mask[i] || !second.mask[i]) continue;
+            double dot = 0;
+            for (int k = 0; k < 3; k++) dot += (double)first.normal[3 * i + k] * (double)second.normal[3 * i + k];
+            off += dot < 0.999;
+        }
+        CHECK(off <= 0.03 * hits); /* at edges and creases the two hits may lie on two sides */
+        if (test_state.verbose)
+            printf("    %s: %d hits, %d differ, queries %llu and %llu\n", nets[which].name, hits, differ,
+                   first.stats.queries, second.stats.queries);
+        mixture_close(&x);
+    }
+    dist_context_destroy(ctx);
+}
+
+TEST(a_scene_of_one_unmoved_instance_looks_like_its_field)
+{
+    dist_context *ctx = test_context();
+    for (int which = 0; which < 2 + KINDS; which++) {
+        mixture x;
+        dist_instance instance;
+        mixture_open(&x, which < 3 ? 0 : which - 3, ctx);
+        const part *a = &x.w.part[which < 3 ? which : 3];
+        memset(&instance, 0, sizeof instance);
+        instance.field = &a->field;
+        dist_scene *scene = dist_scene_create(ctx, 1, &instance);
+        dist_field field = dist_scene_field(scene);
+        CHECK_NEAR(a->field.radius, field.radius, 0);
+        CHECK_NEAR_ARRAY(3, a->field.center, field.center, 0);
+        dist_camera camera = camera_for(&field, SIDE);
+        dist_images out = planes_of(&first), plain = planes_of(&second);
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, NULL), ctx);
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &a->field, &camera, NULL, &plain, NULL), ctx);
+        int differ = compare(&first, &second);
+        CHECK(differ <= (which < 3 ? 0 : hits_of(&first) / 500)); /* nets steeper than their figure: grazing rays */
+        CHECK(hits_of(&first) > PIXELS / 20);
+        int off = 0, near = 0; /* the silhouette is the same where it is below a fifth of the radius */
+        for (int i = 0; i < PIXELS; i++) {
+            if (second.silhouette[i] > 0.18f * field.radius || first.silhouette[i] > 0.18f * field.radius) continue;
+            near++;
+            off += fabs((double)first.silhouette[i] - (double)second.silhouette[i]) > 0.005 * (double)field.radius;
+        }
+        CHECK(off <= (which < 3 ? 0 : near / 50));
+        dist_scene_destroy(scene);
+        mixture_close(&x);
+    }
+    dist_context_destroy(ctx);
+}
+
+TEST(a_scene_of_scenes_is_the_flat_scene)
+{
+    enum { N = 2000 };
+    static float points[3 * N], flat[N], nested[N], d_flat[100], d_nested[100];
+    dist_context *ctx = test_context();
+    mixture x;
+    test_random random = test_random_seed(3);
+    mixture_open(&x, 0, ctx);
+    dist_instance pairs[2][2], both[2];
+    dist_scene *scenes[2];
+    dist_field fields[2];
+    memset(pairs, 0, sizeof pairs);
+    memset(both, 0, sizeof both);
+    for (int k = 0; k < 4; k++) {
+        pairs[k / 2][k % 2].field = &x.w.part[k].field;
+        pairs[k / 2][k % 2].placement = x.w.part[k].placement;
+    }
+    for (int k = 0; k < 2; k++) {
+        scenes[k] = dist_scene_create(ctx, 2, pairs[k]);
+        fields[k] = dist_scene_field(scenes[k]);
+        both[k].field = &fields[k];
+    }
+    dist_scene *scene = dist_scene_create(ctx, 2, both);
+    dist_field field = dist_scene_field(scene);
+    near_points(&random, &x.w, N, 0.95, points);
+    CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &x.w.field, N, points, flat, NULL), ctx);
+    CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &field, N, points, nested, NULL), ctx);
+    double worst = 0;
+    int judged = 0, kept = 0;
+    for (int i = 0; i < N; i++) {
+        if (flat[i] > 0.05f || nested[i] > 0.05f) continue; /* farther off the lower bounds are other spheres' */
+        worst = fmax(worst, fabs((double)flat[i] - (double)nested[i]));
+        memmove(points + 3 * kept++, points + 3 * i, 3 * sizeof(float));
+        judged++;
+    }
+    CHECK(judged > 100);
+    CHECK_NEAR(0, worst, 2e-6);
+    dist_gradients grads;
+    memset(&grads, 0, sizeof grads);
+    memset(d_flat, 0, sizeof d_flat);
+    memset(d_nested, 0, sizeof d_nested);
+    for (int i = 0; i < kept; i++) flat[i] = 1.0f;
+    grads.code = d_flat;
+    CHECK_STATUS(DIST_OK, dist_field_backward(ctx, &x.w.field, (size_t)kept, points, flat, NULL, NULL, NULL, &grads),
+                 ctx);
+    grads.code = d_nested;
+    CHECK_STATUS(DIST_OK, dist_field_backward(ctx, &field, (size_t)kept, points, flat, NULL, NULL, NULL, &grads), ctx);
+    for (int k = 0; k < 2; k++) {
+        int from = dist_scene_offset(x.w.scene, 2 * k), size = dist_scene_offset(x.w.scene, 2 * k + 2) - from;
+        CHECK_NEAR_ARRAY((size_t)size, d_flat + from, d_nested + dist_scene_offset(scene, k), 2e-3);
+    }
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_scene_set(scenes[0], 0, &both[0]), ctx); /* itself */
+    dist_instance loop = both[0];
+    loop.field = &field;
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_scene_set(scenes[0], 0, &loop), ctx); /* itself, by way of another */
+    dist_scene_destroy(scene);
+    dist_scene_destroy(scenes[0]);
+    dist_scene_destroy(scenes[1]);
+    mixture_close(&x);
+    dist_context_destroy(ctx);
+}
+
+/* ---- what it costs ----------------------------------------------------------------------------------------------- */
+
+/* 20 nets on a shelf; gap: between their spheres, in radii. */
+static void shelf_open(world *w, mixture *x, dist_context *ctx, float gap)
+{
+    test_random random = test_random_seed(9);
+    memset(w, 0, sizeof *w);
+    w->ctx = ctx;
+    w->count = 20;
+    for (int k = 0; k < w->count; k++) {
+        w->part[k] = part_make(ctx, NET, &x->m, x->net, &random);
+        float at = (2 + gap) * 0.5f;
+        part_place(&w->part[k], 0.5f, &random, at * (float)(k % 5), at * (float)(k / 5 % 2), at * (float)(k / 10));
+    }
+    world_open(w);
+}
+
+TEST(twenty_instances_cost_a_query_no_more_than_one_and_a_fifth)
+{
+    dist_context *ctx = test_context();
+    for (int touching = 0; touching < 2; touching++) {
+        mixture x;
+        static world w;
+        mixture_open(&x, 0, ctx);
+        shelf_open(&w, &x, ctx, touching ? 0.0f : 0.3f);
+        dist_camera camera = camera_for(&w.field, SIDE);
+        dist_images out = planes_of(&first);
+        unsigned long long before = dist_scene_queries(w.scene);
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &w.field, &camera, NULL, &out, NULL), ctx);
+        double asked = (double)(dist_scene_queries(w.scene) - before), per = asked / (double)first.stats.queries;
+        CHECK(hits_of(&first) > PIXELS / 20);
+        CHECK(per <= 1.2);
+        if (test_state.verbose)
+            printf("    %s: %.0f of the nets for %.0f of the scene: %.3f\n", touching ? "touching" : "apart", asked,
+                   (double)first.stats.queries, per);
+        world_close(&w);
+        mixture_close(&x);
+    }
+    dist_context_destroy(ctx);
+}
+
+TEST(a_scene_has_the_same_bits_for_any_number_of_threads)
+{
+    enum { N = 2500 };
+    static float points[3 * N], sdf[2][N], gradient[2][3 * N], d_code[2][100], seeds[N];
+    test_random random = test_random_seed(31);
+    random_points(&random, N, 2.0, points);
+    for (int i = 0; i < N; i++) seeds[i] = test_random_float(&random, -1, 1);
+    memset(d_code, 0, sizeof d_code);
+    for (int run = 0; run < 2; run++) {
+        test_scheduler scheduler = {7, 0};
+        dist_context_desc desc = test_context_desc();
+        desc.workers = run ? 7 : 1;
+        if (run) desc.scheduler = test_scheduler_hook(&scheduler);
+        dist_context *ctx = dist_context_create(&desc);
+        mixture x;
+        dist_gradients grads;
+        memset(&grads, 0, sizeof grads);
+        mixture_open(&x, 0, ctx);
+        grads.code = d_code[run];
+        CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &x.w.field, N, points, sdf[run], gradient[run]), ctx);
+        CHECK_STATUS(DIST_OK, dist_field_backward(ctx, &x.w.field, N, points, seeds, NULL, NULL, NULL, &grads), ctx);
+        mixture_close(&x);
+        dist_context_destroy(ctx);
+    }
+    CHECK_BYTES(sizeof sdf[0], sdf[0], sdf[1]);
+    CHECK_BYTES(sizeof gradient[0], gradient[0], gradient[1]);
+    CHECK_BYTES(sizeof d_code[0], d_code[0], d_code[1]);
+}
+
+/* ---- fits -------------------------------------------------------------------------------------------------------- */
+
+typedef struct fit {
+    double start, end; /* loss */
+    double off[7];     /* the numbers of the placement that are left */
+    double code;       /* largest */
+} fit;
+
+/* A torus and a box: the torus's placement, and its code as well, from a depth picture and a silhouette. */
+static fit fit_torus(dist_context *ctx, int with_code, const float step[7])
+{
+    enum { W = 40, N = W * W };
+    static float depth[N], target[N], silhouette[N], d_depth[N], d_silhouette[N], moments[64], x[32];
+    static unsigned char mask[N], outline[N];
+    float torus[5] = {0, 0, 0, 0.55f, 0.2f}, box[6] = {0, 0, 0, 0.3f, 0.3f, 0.3f}, truth[5], d_code[32];
+    dist_field fields[2] = {dist_field_torus(torus), dist_field_box(box)};
+    dist_instance instances[2];
+    fit result;
+    memset(&result, 0, sizeof result);
+    memset(instances, 0, sizeof instances);
+    memcpy(truth, torus, sizeof truth);
+    for (int k = 0; k < 2; k++) instances[k].field = &fields[k];
+    float turned[7] = {0.1f, 0.5f, 0.2f, 0.3f, 0.1f, 0.05f, 0.0f};
+    dist_similarity_move(&instances[0].placement, turned);
+    instances[1].placement.translation[0] = -1.0f;
+    dist_similarity goal = instances[0].placement;
+    dist_scene *scene = dist_scene_create(ctx, 2, instances);
+    dist_field field = dist_scene_field(scene);
+    dist_camera camera = camera_for(&field, W);
+    dist_tape *tape = dist_tape_create(ctx, &camera, NULL);
+    dist_images out, d_out;
+    dist_gradients grads;
+    dist_adam adam;
+    memset(&out, 0, sizeof out);
+    memset(&d_out, 0, sizeof d_out);
+    memset(&grads, 0, sizeof grads);
+    memset(&adam, 0, sizeof adam);
+    memset(moments, 0, sizeof moments);
+    out.depth = target;
+    out.mask = outline;
+    dist_render(ctx, &field, &camera, NULL, &out, NULL);
+    dist_similarity_move(&instances[0].placement, step);
+    if (with_code) torus[3] += 0.08f, torus[4] -= 0.05f;
+    out.depth = depth;
+    out.mask = mask;
+    out.silhouette = silhouette;
+    d_out.depth = d_depth;
+    d_out.silhouette = d_silhouette;
+    grads.code = d_code;
+    adam.moments = moments;
+    int first_number = dist_scene_offset(scene, 0) + 5;
+    for (int i = 0; i < 150; i++) {
+        adam.rate = 0.02f * powf(0.02f, (float)i / 150.0f);
+        memset(d_depth, 0, sizeof d_depth);
+        memset(d_silhouette, 0, sizeof d_silhouette);
+        memset(d_code, 0, sizeof d_code);
+        dist_scene_set(scene, 0, &instances[0]);
+        field = dist_scene_field(scene);
+        dist_render(ctx, &field, &camera, NULL, &out, tape);
+        result.end = (double)dist_loss_depth(N, depth, target, mask, 5.0f, d_depth) +
+                     (double)dist_loss_silhouette(N, silhouette, outline, 5.0f, d_silhouette);
+        if (i == 0) result.start = result.end;
+        CHECK_STATUS(DIST_OK, dist_render_backward(ctx, tape, &d_out, &grads), ctx);
+        memset(x, 0, sizeof x); /* each step begins at the placement that is */
+        if (with_code) memcpy(x, torus, sizeof torus);
+        dist_adam_step(&adam, 12, x, d_code);
+        dist_similarity_move(&instances[0].placement, x + first_number);
+        if (with_code) memcpy(torus + 3, x + 3, 2 * sizeof(float));
+    }
+    const dist_similarity *now = &instances[0].placement;
+    double axis = 0; /* a torus does not feel a turn around its own axis */
+    for (int i = 0; i < 3; i++) {
+        axis += (double)now->rotation[3 * i + 1] * (double)goal.rotation[3 * i + 1];
+        result.off[4 + i] = (double)now->translation[i] - (double)goal.translation[i];
+    }
+    result.off[0] = log((double)now->scale / (double)goal.scale);
+    result.off[1] = acos(fmin(1, fabs(axis)));
+    for (int i = 3; i < 5; i++) /* in the world: the scale and the radii pull at the same */
+        result.code = fmax(result.code, fabs((double)(now->scale * torus[i]) - (double)(goal.scale * truth[i])));
+    dist_tape_destroy(tape);
+    dist_scene_destroy(scene);
+    return result;
+}
+
+TEST(a_placement_is_found_from_a_picture_alone_and_with_the_code)
+{
+    dist_context *ctx = test_context();
+    float step[7] = {0.15f, 0.2f, -0.1f, 0.15f, 0.1f, -0.08f, 0.12f};
+    for (int with_code = 0; with_code < 2; with_code++) {
+        fit f = fit_torus(ctx, with_code, step);
+        if (test_state.verbose)
+            printf("    loss %.4f -> %.6f, scale %.4f, angle %.4f, translation %.4f %.4f %.4f, radii %.4f\n", f.start,
+                   f.end, f.off[0], f.off[1], f.off[4], f.off[5], f.off[6], f.code);
+        CHECK(f.end < 0.03 * f.start);
+        if (!with_code) CHECK_NEAR(0, f.off[0], 5e-3);
+        CHECK_NEAR(0, f.off[1], 2e-2);
+        for (int i = 4; i < 7; i++) CHECK_NEAR(0, f.off[i], 5e-3);
+        CHECK_NEAR(0, f.code, 5e-3);
+    }
+    dist_context_destroy(ctx);
+}
+
+/* ---- the door ---------------------------------------------------------------------------------------------------- */
+
+TEST(moving_a_placement_keeps_it_a_similarity)
+{
+    dist_similarity s;
+    test_random random = test_random_seed(2);
+    memset(&s, 0, sizeof s);
+    double logarithm = 0;
+    for (int i = 0; i < 500; i++) {
+        float step[7];
+        test_random_fill(&random, 7, step, -1, 1);
+        logarithm += (double)step[0];
+        dist_similarity_move(&s, step);
+    }
+    double m[9], determinant;
+    for (int i = 0; i < 9; i++) m[i] = (double)s.rotation[i];
+    CHECK_NEAR(0, disti_rotation_off(m, &determinant), 1e-6);
+    CHECK_NEAR(1, determinant, 1e-6);
+    CHECK_NEAR(1, (double)s.scale / exp(logarithm), 1e-4);
+    float zero[7] = {0};
+    memset(&s, 0, sizeof s);
+    dist_similarity_move(&s, zero);
+    CHECK_NEAR(1, s.scale, 0);
+    CHECK_NEAR(1, s.rotation[4], 0);
+    dist_similarity_move(NULL, zero);
+    dist_similarity_move(&s, NULL);
+}
+
+static int refused(dist_context *ctx, const dist_instance *instance, const char *sentence)
+{
+    dist_scene *scene = dist_scene_create(ctx, 1, instance);
+    int good = CHECK(scene == NULL) & CHECK_TEXT(sentence, dist_context_message(ctx));
+    dist_scene_destroy(scene);
+    dist_context_clear(ctx);
+    return good;
+}
+
+TEST(scenes_refuse_what_cannot_be_placed)
+{
+    dist_context *ctx = test_context(), *other = test_context();
+    float sphere[4] = {0, 0, 0, 1}, torus[5] = {0, 0, 0, 0.5f, 0.2f};
+    dist_field field = dist_field_sphere(sphere), bad = field, ring = dist_field_torus(torus);
+    dist_instance good, x;
+    memset(&good, 0, sizeof good);
+    good.field = &field;
+    CHECK(dist_scene_create(NULL, 1, &good) == NULL);
+    CHECK(dist_scene_create(ctx, 0, &good) == NULL);
+    dist_context_clear(ctx);
+    CHECK(dist_scene_create(ctx, 1, NULL) == NULL);
+    CHECK_TEXT("count is 1", dist_context_message(ctx));
+    dist_context_clear(ctx);
+    x = good;
+    x.field = NULL;
+    refused(ctx, &x, "field is NULL");
+    bad.eval_fn = NULL;
+    x.field = &bad;
+    refused(ctx, &x, "eval_fn is NULL");
+    bad = field;
+    bad.owner = other;
+    refused(ctx, &x, "another context");
+    static const struct {
+        float scale, first, second;
+        const char *sentence;
+    } cases[] = {{-1, 0, 0, "scale is -1"}, {1, 2, 0, "not a rotation"}, {1, 1, 0, "not a rotation"},
+                 {1e38f, 0, 3e38f, "does not fit"}};
+    for (size_t i = 0; i < sizeof cases / sizeof cases[0]; i++) {
+        x = good;
+        x.placement.scale = cases[i].scale;
+        x.placement.rotation[0] = cases[i].first;
+        x.placement.translation[0] = cases[i].second;
+        if (i == 3) bad = field, bad.radius = 100, x.field = &bad;
+        refused(ctx, &x, cases[i].sentence);
+    }
+    x = good;
+    x.placement.rotation[0] = x.placement.rotation[4] = 1;
+    x.placement.rotation[8] = -1; /* a mirror */
+    refused(ctx, &x, "determinant -1");
+    uint32_t bits = 0x7fc00000u;
+    x = good;
+    memcpy(&x.placement.translation[1], &bits, sizeof bits);
+    refused(ctx, &x, "must be finite");
+    dist_scene *scene = dist_scene_create(ctx, 1, &good);
+    REQUIRE(scene != NULL);
+    x = good;
+    x.field = &ring; /* five numbers in place of four */
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_scene_set(scene, 0, &x), ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_scene_set(scene, 1, &good), ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_scene_set(scene, -1, &good), ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_scene_set(scene, 0, NULL), ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_scene_set(NULL, 0, &good), ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_scene_find(scene, 1, NULL, NULL), ctx);
+    x.field = NULL; /* stays */
+    x.placement.translation[2] = 3;
+    CHECK_STATUS(DIST_OK, dist_scene_set(scene, 0, &x), ctx);
+    CHECK_NEAR(3, dist_scene_field(scene).center[2], 0);
+    CHECK_EQUAL(-1, dist_scene_offset(scene, 2));
+    CHECK_EQUAL(-1, dist_scene_offset(NULL, 0));
+    CHECK_EQUAL(11, dist_scene_offset(scene, 1));
+    CHECK(dist_scene_field(NULL).eval_fn == NULL);
+    CHECK_EQUAL(0, dist_scene_queries(NULL));
+    dist_scene_destroy(scene);
+    dist_scene_destroy(NULL);
+    dist_context_destroy(ctx);
+    dist_context_destroy(other);
+}
+
+/* NaN of a field, and points that are not finite, come out as such. */
+static void poison_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    uint32_t bits = 0x7fc00000u;
+    (void)user;
+    (void)worker;
+    (void)points;
+    for (size_t i = 0; i < n; i++) memcpy(sdf + i, &bits, sizeof bits);
+    if (gradient) memset(gradient, 0, 3 * n * sizeof(float));
+}
+
+TEST(what_is_not_finite_stays_so)
+{
+    dist_context *ctx = test_context();
+    float sphere[4] = {0, 0, 0, 0.5f};
+    dist_field field = dist_field_sphere(sphere), poison = field;
+    dist_instance two[2];
+    uint32_t infinity = 0x7f800000u, nan = 0x7fc00000u;
+    poison.eval_fn = poison_eval;
+    memset(two, 0, sizeof two);
+    two[0].field = &field;
+    two[1].field = &poison;
+    two[1].placement.translation[0] = 2;
+    dist_scene *scene = dist_scene_create(ctx, 2, two);
+    dist_field all = dist_scene_field(scene);
+    float points[12] = {0, 0, 0, 2, 0, 0, 1, 1, 1, 1, 1, 1}, sdf[4], gradient[12];
+    memcpy(points + 7, &nan, sizeof nan);
+    memcpy(points + 11, &infinity, sizeof infinity);
+    for (int with = 0; with < 2; with++) {
+        CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &all, 4, points, sdf, with ? gradient : NULL), ctx);
+        CHECK_NEAR(-0.5, sdf[0], 1e-6);
+        for (int i = 1; i < 4; i++) CHECK(!disti_finite(sdf[i]));
+    }
+    dist_scene_destroy(scene);
+    dist_context_destroy(ctx);
+}
+
+TEST(colors_are_those_of_the_instance_that_is_hit)
+{
+    enum { N = 200 };
+    static float points[3 * N], color[3 * N], expected[3 * N];
+    static const model_desc colored = {.name = "colored", .code_size = 2, .channels = "sdf,r,g,b", .clamp = 0.3};
+    dist_context *ctx = test_context();
+    model m = model_make(&colored, 4);
+    dist_net *net = model_load(ctx, &m);
+    float codes[2][2] = {{0.5f, -0.5f}, {-0.4f, 0.3f}};
+    dist_shape *shapes[2];
+    dist_field fields[2];
+    dist_instance two[2];
+    test_random random = test_random_seed(6);
+    memset(two, 0, sizeof two);
+    for (int k = 0; k < 2; k++) {
+        shapes[k] = dist_shape_create(ctx, net, codes[k]);
+        fields[k] = dist_shape_field(shapes[k]);
+        two[k].field = &fields[k];
+        two[k].placement.translation[0] = 3.0f * (float)k;
+        two[k].placement.scale = 0.5f;
+    }
+    dist_scene *scene = dist_scene_create(ctx, 2, two);
+    dist_field all = dist_scene_field(scene);
+    REQUIRE(all.color_fn != NULL);
+    for (int i = 0; i < N; i++) {
+        float p[3];
+        test_random_fill(&random, 3, p, -0.25f, 0.25f);
+        int k = i % 2;
+        fields[k].color_fn(fields[k].user, 0, 1, p, expected + 3 * i);
+        for (int axis = 0; axis < 3; axis++) points[3 * i + axis] = 0.5f * p[axis] + (axis == 0 ? 3.0f * (float)k : 0);
+    }
+    all.color_fn(all.user, 0, N, points, color);
+    CHECK_NEAR_ARRAY(3 * N, expected, color, 2e-6);
+    float sphere[4] = {0, 0, 0, 0.5f};
+    dist_field plain = dist_field_sphere(sphere);
+    two[1].field = &plain;
+    dist_scene *mixed = dist_scene_create(ctx, 2, two);
+    CHECK(dist_scene_field(mixed).color_fn == NULL);
+    dist_scene_destroy(mixed);
+    dist_scene_destroy(scene);
+    for (int k = 0; k < 2; k++) dist_shape_destroy(shapes[k]);
+    dist_net_destroy(net);
+    model_free(&m);
+    dist_context_destroy(ctx);
+}
+
+TEST(only_create_takes_memory_and_a_failed_one_leaves_none)
+{
+    test_allocator allocator;
+    dist_context_desc desc = test_context_desc();
+    memset(&allocator, 0, sizeof allocator);
+    desc.allocator = test_allocator_hook(&allocator);
+    dist_context *ctx = dist_context_create(&desc);
+    float sphere[4] = {0, 0, 0, 0.5f}, points[300], sdf[100], gradient[300], d_code[22];
+    dist_field field = dist_field_sphere(sphere);
+    dist_instance two[2];
+    dist_gradients grads;
+    test_random random = test_random_seed(8);
+    random_points(&random, 100, 2, points);
+    memset(two, 0, sizeof two);
+    memset(&grads, 0, sizeof grads);
+    memset(d_code, 0, sizeof d_code);
+    grads.code = d_code;
+    two[0].field = two[1].field = &field;
+    two[1].placement.translation[0] = 1;
+    size_t live = allocator.live_blocks, requests = allocator.requests;
+    dist_scene *scene = dist_scene_create(ctx, 2, two);
+    size_t wanted = allocator.requests - requests;
+    dist_field all = dist_scene_field(scene);
+    requests = allocator.requests;
+    dist_scene_set(scene, 1, &two[0]);
+    dist_field_eval(ctx, &all, 100, points, sdf, gradient);
+    dist_field_backward(ctx, &all, 100, points, sdf, NULL, NULL, NULL, &grads);
+    CHECK_EQUAL(requests, allocator.requests);
+    CHECK_STATUS(DIST_OK, dist_context_status(ctx), ctx);
+    dist_scene_destroy(scene);
+    for (size_t n = 1; n <= wanted; n++) {
+        dist_context_destroy(ctx);
+        allocator.fail_at = 0;
+        ctx = dist_context_create(&desc);
+        live = allocator.live_blocks;
+        allocator.fail_at = allocator.requests + n;
+        CHECK(dist_scene_create(ctx, 2, two) == NULL);
+        CHECK_STATUS(DIST_OUT_OF_MEMORY, dist_context_status(ctx), ctx);
+        CHECK_EQUAL(live, allocator.live_blocks);
+    }
+    dist_context_destroy(ctx);
+    CHECK_EQUAL(0, allocator.live_blocks);
+    CHECK_EQUAL(0, allocator.errors);
+}
+
+int main(int argc, char **argv)
+{
+    test_begin(argc, argv);
+    RUN(a_scene_is_the_least_of_its_placed_fields);
+    RUN(no_field_is_asked_outside_its_sphere);
+    RUN(the_adjoint_of_a_placement_is_its_derivative_in_double);
+    RUN(gradients_for_points_codes_and_placements_are_those_of_double);
+    RUN(a_scene_looks_like_the_union_that_asks_everything);
+    RUN(a_scene_of_one_unmoved_instance_looks_like_its_field);
+    RUN(a_scene_of_scenes_is_the_flat_scene);
+    RUN(twenty_instances_cost_a_query_no_more_than_one_and_a_fifth);
+    RUN(a_scene_has_the_same_bits_for_any_number_of_threads);
+    RUN(a_placement_is_found_from_a_picture_alone_and_with_the_code);
+    RUN(moving_a_placement_keeps_it_a_similarity);
+    RUN(scenes_refuse_what_cannot_be_placed);
+    RUN(what_is_not_finite_stays_so);
+    RUN(colors_are_those_of_the_instance_that_is_hit);
+    RUN(only_create_takes_memory_and_a_failed_one_leaves_none);
+    return test_report();
+}

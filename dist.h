@@ -1441,9 +1441,10 @@ static void disti_outer_scalar(const float *w, const float *s, const int *alive,
      DISTI_VEC, DISTI_LANES             a vector, and how many floats it holds
      DISTI_SET1(s) DISTI_LOAD(p) DISTI_STORE(p, v) DISTI_ADD(a, b) DISTI_FMA(a, b, c)    the last is a b + c
      DISTI_RELU(v) DISTI_POSITIVE(v)    max(v, 0), and the bits of the lanes that are greater than 0
+     DISTI_BITS(row, column, v)         the latter into a mask's row, from this column on
      DISTI_KEEP(v, bits)                v with 0 where the lane's bit is 0
      DISTI_DEPTH                        rows that one pass takes: 112 of 192 bytes stay in a first cache of 32 KiB
-                                        beside the weights; wide vectors ask for less and can use the second cache
+                                        beside the weights; wider vectors ask for less and can use the second cache
    A tile of R rows and V vectors keeps its sums in variables a<row><vector>: gcc holds those in registers where it
    would spill an array. A row's factor is broadcast and serves its V vectors; in the forward pass the factors of a
    tile stand side by side, elsewhere at R offsets k<row>. */
@@ -1457,7 +1458,7 @@ static void disti_outer_scalar(const float *w, const float *s, const int *alive,
 #define DISTI_X3(M, i) M(i, 0) M(i, 1) M(i, 2)
 #define DISTI_Y1(M, V) M(0, V)
 #define DISTI_Y4(M, V) M(0, V) M(1, V) M(2, V) M(3, V)
-#define DISTI_Y8(M, V) M(0, V) M(1, V) M(2, V) M(3, V) M(4, V) M(5, V) M(6, V) M(7, V)
+#define DISTI_Y8(M, V) DISTI_Y4(M, V) M(4, V) M(5, V) M(6, V) M(7, V)
 
 #define DISTI_ZERO1(i, j) DISTI_VEC a##i##j = DISTI_SET1(0.0f);
 #define DISTI_BIAS1(i, j) a##i##j = DISTI_SET1(bias[i]);
@@ -1466,27 +1467,30 @@ static void disti_outer_scalar(const float *w, const float *s, const int *alive,
 #define DISTI_BIAS(i, V) DISTI_X##V(DISTI_BIAS1, i)
 #define DISTI_AGAIN(i, V) DISTI_X##V(DISTI_AGAIN1, i)
 
-#define DISTI_INPUT(i, j) const DISTI_VEC x##j = DISTI_LOAD(x + j * DISTI_LANES);
+#define DISTI_INPUT(i, j) const DISTI_VEC x##j = DISTI_LOAD(xs + j * DISTI_LANES);
 #define DISTI_MAC(i, j) a##i##j = DISTI_FMA(b, x##j, a##i##j);
-#define DISTI_SIDE(i, V) { const DISTI_VEC b = DISTI_SET1(w[i]); DISTI_X##V(DISTI_MAC, i) }
-#define DISTI_APART(i, V) { const DISTI_VEC b = DISTI_SET1(w[k##i]); DISTI_X##V(DISTI_MAC, i) }
-#define DISTI_STEP(R, V, FACTORS) { DISTI_X##V(DISTI_INPUT, 0) DISTI_Y##R(FACTORS, V) }
+#define DISTI_SIDE(i, V) { const DISTI_VEC b = DISTI_SET1(ws[i]); DISTI_X##V(DISTI_MAC, i) }
+#define DISTI_APART(i, V) { const DISTI_VEC b = DISTI_SET1(ws[k##i]); DISTI_X##V(DISTI_MAC, i) }
+#define DISTI_STEP(R, V, FACTORS, w, x) \
+    { const float *const ws = w, *const xs = x; DISTI_X##V(DISTI_INPUT, 0) DISTI_Y##R(FACTORS, V) DISTI_FENCE }
+
+/* Keeps gcc from mixing the loads of unrolled steps until it runs out of registers. */
+#if defined(__GNUC__) && !defined(__clang__)
+#define DISTI_FENCE __asm__ volatile("" : : : "memory");
+#else
+#define DISTI_FENCE
+#endif
 
 /* Prefetches reach beyond the end of an array, where a pointer may not go. */
 #define DISTI_AHEAD(p, floats) DISTI_PREFETCH((const char *)((uintptr_t)(p) + sizeof(float) * (size_t)(floats)))
 #define DISTI_VECTORS(floats) (((floats) + DISTI_LANES - 1) / DISTI_LANES)
 
-#define DISTI_BITS1(i, j) bits |= (uint64_t)DISTI_POSITIVE(a##i##j) << (j * DISTI_LANES);
-#define DISTI_STORE_RELU1(i, j) DISTI_STORE(y + i * DISTI_BLOCK + j * DISTI_LANES, DISTI_RELU(a##i##j));
+#define DISTI_STORE_RELU1(i, j)                                                                                        \
+    DISTI_BITS(mask + i, c + j * DISTI_LANES, a##i##j)                                                                 \
+    DISTI_STORE(y + i * DISTI_BLOCK + j * DISTI_LANES, DISTI_RELU(a##i##j));
 #define DISTI_STORE_SUM1(i, j) DISTI_STORE(y + i * DISTI_BLOCK + j * DISTI_LANES, DISTI_ADD(a##i##j, DISTI_SET1(0.0f)));
 #define DISTI_STORE_SUM(i, V) DISTI_X##V(DISTI_STORE_SUM1, i)
-#define DISTI_STORE_RELU(i, V)                                                                                         \
-    {                                                                                                                  \
-        uint64_t bits = 0;                                                                                             \
-        DISTI_X##V(DISTI_BITS1, i)                                                                                     \
-        DISTI_X##V(DISTI_STORE_RELU1, i)                                                                               \
-        mask[i] |= (bits << c) & columns;                                                                              \
-    }
+#define DISTI_STORE_RELU(i, V) DISTI_X##V(DISTI_STORE_RELU1, i)
 
 /* Takes inputs from..to-1 of the list or of all; between two passes over DISTI_DEPTH rows the sums wait in y.
    Weights are fetched `ahead` floats early: a little, or a whole panel where passes cut the panels. */
@@ -1494,10 +1498,11 @@ static void disti_outer_scalar(const float *w, const float *s, const int *alive,
     DISTI_NOINLINE DISTI_FUNCTION void disti_gemm_##name(const disti_gemm *g, int o, int c, int from, int to,          \
                                                           size_t ahead)                                                \
     {                                                                                                                  \
-        const float *panel = g->weights + (size_t)(o / 8) * (size_t)g->rows * 8 + o % 8;                               \
-        const float *input = g->x + c;                                                                                 \
+        const size_t panel = (size_t)g->rows * 8, at = (size_t)(unsigned)o;                                            \
+        const float *w = g->weights + at / 8 * panel + at % 8;                                                         \
+        const float *x = g->x + c;                                                                                     \
         const float *bias = g->bias + o;                                                                               \
-        float *y = g->y + (size_t)o * DISTI_BLOCK + c;                                                                 \
+        float *y = g->y + at * DISTI_BLOCK + c;                                                                        \
         DISTI_Y##R(DISTI_ZERO, V)                                                                                      \
         if (from == 0) {                                                                                               \
             DISTI_Y##R(DISTI_BIAS, V)                                                                                  \
@@ -1506,20 +1511,25 @@ static void disti_outer_scalar(const float *w, const float *s, const int *alive,
         }                                                                                                              \
         if (g->alive) {                                                                                                \
             for (const int *alive = g->alive + from, *end = g->alive + to; alive < end; alive++) {                     \
-                const float *w = panel + (size_t)(unsigned)*alive * 8;                                                 \
-                const float *x = input + (size_t)(unsigned)*alive * DISTI_BLOCK;                                       \
-                DISTI_AHEAD(w, ahead);                                                                                 \
-                DISTI_STEP(R, V, DISTI_SIDE)                                                                           \
+                const size_t k = (size_t)(unsigned)*alive;                                                             \
+                DISTI_AHEAD(w + k * 8, ahead);                                                                         \
+                DISTI_STEP(R, V, DISTI_SIDE, w + k * 8, x + k * DISTI_BLOCK)                                           \
             }                                                                                                          \
         } else {                                                                                                       \
-            const float *w = panel + (size_t)from * 8, *x = input + (size_t)from * DISTI_BLOCK;                        \
-            for (const float *end = panel + (size_t)to * 8; w < end; w += 8, x += DISTI_BLOCK) {                       \
+            const float *end = w + (size_t)(unsigned)to * 8;                                                           \
+            w += (size_t)(unsigned)from * 8;                                                                           \
+            x += (size_t)(unsigned)from * DISTI_BLOCK;                                                                 \
+            for (; end - w >= 4 * 8; w += 4 * 8, x += 4 * DISTI_BLOCK) {                                               \
                 DISTI_AHEAD(w, ahead);                                                                                 \
-                DISTI_STEP(R, V, DISTI_SIDE)                                                                           \
+                DISTI_AHEAD(w + 16, ahead);                                                                            \
+                DISTI_STEP(R, V, DISTI_SIDE, w, x)                                                                     \
+                DISTI_STEP(R, V, DISTI_SIDE, w + 8, x + DISTI_BLOCK)                                                   \
+                DISTI_STEP(R, V, DISTI_SIDE, w + 16, x + 2 * DISTI_BLOCK)                                              \
+                DISTI_STEP(R, V, DISTI_SIDE, w + 24, x + 3 * DISTI_BLOCK)                                              \
             }                                                                                                          \
+            for (; w < end; w += 8, x += DISTI_BLOCK) DISTI_STEP(R, V, DISTI_SIDE, w, x)                               \
         }                                                                                                              \
         if (g->mask && to == (g->alive ? g->alive_count : g->rows)) {                                                  \
-            const uint64_t columns = ((uint64_t)1 << g->columns) - 1;                                                  \
             uint64_t *mask = g->mask + o;                                                                              \
             DISTI_Y##R(DISTI_STORE_RELU, V)                                                                            \
         } else {                                                                                                       \
@@ -1555,18 +1565,28 @@ static void disti_outer_scalar(const float *w, const float *s, const int *alive,
         if (g->alive_out) {                                                                                            \
             for (const int *alive = g->alive_out + from, *end = g->alive_out + to; alive < end; alive++) {             \
                 const size_t o = (size_t)(unsigned)*alive;                                                             \
-                const float *w = weights + (o >> 3) * panel + (o & 7);                                                 \
-                const float *x = d_y + o * DISTI_BLOCK;                                                                \
                 DISTI_AHEAD(next, (o >> 3) * panel + (o & 7) * 8);                                                     \
-                DISTI_STEP(R, V, DISTI_APART)                                                                          \
+                DISTI_STEP(R, V, DISTI_APART, weights + (o >> 3) * panel + (o & 7), d_y + o * DISTI_BLOCK)             \
             }                                                                                                          \
         } else {                                                                                                       \
-            for (size_t o = (size_t)(unsigned)from, end = (size_t)(unsigned)to; o < end; o++) {                        \
-                const float *w = weights + (o >> 3) * panel + (o & 7);                                                 \
-                const float *x = d_y + o * DISTI_BLOCK;                                                                \
-                DISTI_AHEAD(next, (o >> 3) * panel + (o & 7) * 8);                                                     \
-                DISTI_STEP(R, V, DISTI_APART)                                                                          \
+            size_t o = (size_t)(unsigned)from;                                                                         \
+            const size_t end = (size_t)(unsigned)to;                                                                   \
+            const float *w = weights + (o >> 3) * panel, *x = d_y + o * DISTI_BLOCK;                                   \
+            next += (o >> 3) * panel;                                                                                  \
+            for (; o + 8 <= end; o += 8, w += panel - 8, next += panel) {                                              \
+                DISTI_AHEAD(next, 0);                                                                                  \
+                DISTI_AHEAD(next, 16);                                                                                 \
+                DISTI_AHEAD(next, 32);                                                                                 \
+                DISTI_AHEAD(next, 48);                                                                                 \
+                for (int half = 0; half < 2; half++, w += 4, x += 4 * DISTI_BLOCK) {                                   \
+                    DISTI_STEP(R, V, DISTI_APART, w, x)                                                                \
+                    DISTI_STEP(R, V, DISTI_APART, w + 1, x + DISTI_BLOCK)                                              \
+                    DISTI_STEP(R, V, DISTI_APART, w + 2, x + 2 * DISTI_BLOCK)                                          \
+                    DISTI_STEP(R, V, DISTI_APART, w + 3, x + 3 * DISTI_BLOCK)                                          \
+                }                                                                                                      \
             }                                                                                                          \
+            for (; o < end; o++)                                                                                       \
+                DISTI_STEP(R, V, DISTI_APART, weights + (o >> 3) * panel + (o & 7), d_y + o * DISTI_BLOCK)             \
         }                                                                                                              \
         DISTI_Y##R(DISTI_STORE_KEEP, V)                                                                                \
     }
@@ -1599,7 +1619,7 @@ static void disti_outer_scalar(const float *w, const float *s, const int *alive,
         DISTI_Y##R(DISTI_FETCH, V)                                                                                     \
         DISTI_Y##R(DISTI_OUTPUT, V)                                                                                    \
         DISTI_Y##R(DISTI_ZERO, V)                                                                                      \
-        for (; w < end; w++, x += x_stride) DISTI_STEP(R, V, DISTI_APART)                                              \
+        for (; w < end; w++, x += x_stride) DISTI_STEP(R, V, DISTI_APART, w, x)                                        \
         DISTI_Y##R(DISTI_ACCUMULATE, V)                                                                                \
     }
 
@@ -1618,8 +1638,7 @@ static void disti_outer_scalar(const float *w, const float *s, const int *alive,
             DISTI_BIAS(0, 3)                                                                                           \
             for (int n = 0; n < count; n++) {                                                                          \
                 const size_t k0 = (size_t)(unsigned)(alive ? alive[n] : n);                                            \
-                const float *x = matrix + k0 * DISTI_BLOCK + c;                                                        \
-                DISTI_STEP(1, 3, DISTI_APART)                                                                          \
+                DISTI_STEP(1, 3, DISTI_APART, w, matrix + k0 * DISTI_BLOCK + c)                                        \
             }                                                                                                          \
             DISTI_STORE_SUM(0, 3)                                                                                      \
         }                                                                                                              \
@@ -1631,7 +1650,7 @@ static void disti_outer_scalar(const float *w, const float *s, const int *alive,
         const DISTI_VEC zero = DISTI_SET1(0.0f);                                                                       \
         const int count = alive ? alive_count : rows;                                                                  \
         for (int c = 0; c < columns; c += 3 * DISTI_LANES) {                                                           \
-            const float *x = s + c;                                                                                    \
+            const float *const xs = s + c;                                                                             \
             DISTI_X3(DISTI_INPUT, 0)                                                                                   \
             for (int n = 0; n < count; n++) {                                                                          \
                 const size_t k = (size_t)(unsigned)(alive ? alive[n] : n);                                             \
@@ -1643,31 +1662,32 @@ static void disti_outer_scalar(const float *w, const float *s, const int *alive,
         }                                                                                                              \
     }
 
-/* One pass over eight rows by R, with the tile that is V vectors wide. */
-#define DISTI_EIGHT(R, left, call)                                                                                     \
-    for (int i = 0; i < 8 && i < (left); i += R) call;
-#define DISTI_DRIVERS(isa, RW, VW, RM, VM, RN)                                                                         \
+/* All tiles of `total` rows in one strip of columns: R rows at a time where the strip is W vectors wide, else eight. */
+#define DISTI_STRIP(kernel, isa, total, R, W, arguments)                                                               \
+    for (int n = 0; n < (total); n += vectors >= W ? R : 8) {                                                          \
+        const int left = (total) - n;                                                                                  \
+        (void)left;                                                                                                    \
+        if (vectors >= W) disti_##kernel##_wide_##isa arguments;                                                       \
+        else if (vectors == 2) disti_##kernel##_middle_##isa arguments;                                                \
+        else disti_##kernel##_narrow_##isa arguments;                                                                  \
+    }
+#define DISTI_DRIVERS(isa, R, W)                                                                                       \
     DISTI_FUNCTION void disti_gemm_##isa(const disti_gemm *g)                                                          \
     {                                                                                                                  \
-        const int count = g->alive ? g->alive_count : g->rows;                                                         \
+        const int count = g->alive ? g->alive_count : g->rows, out = (g->out + 7) / 8 * 8;                             \
         const size_t ahead = count > DISTI_DEPTH ? (size_t)g->rows * 8 : 256;                                          \
-        for (int o = 0; g->mask && o < (g->out + 7) / 8 * 8; o++) g->mask[o] = 0;                                      \
+        if (g->mask) memset(g->mask, 0, (size_t)(unsigned)out * sizeof(uint64_t));                                     \
         int to = 0;                                                                                                    \
         do {                                                                                                           \
             const int from = to;                                                                                       \
             to = DISTI_MIN(from + DISTI_DEPTH, count);                                                                 \
-            for (int o = 0; o < g->out; o += 8) {                                                                      \
-                for (int c = 0; c < g->columns; c += VW * DISTI_LANES) {                                               \
-                    const int vectors = DISTI_VECTORS(g->columns - c);                                                 \
-                    if (vectors >= VW)                                                                                 \
-                        DISTI_EIGHT(RW, 8, disti_gemm_wide_##isa(g, o + i, c, from, to, ahead))                        \
-                    else if (vectors >= VM)                                                                            \
-                        DISTI_EIGHT(RM, 8, disti_gemm_middle_##isa(g, o + i, c, from, to, ahead))                      \
-                    else                                                                                               \
-                        DISTI_EIGHT(RN, 8, disti_gemm_narrow_##isa(g, o + i, c, from, to, ahead))                      \
-                }                                                                                                      \
+            for (int c = 0; c < g->columns; c += W * DISTI_LANES) {                                                    \
+                const int vectors = DISTI_VECTORS(g->columns - c);                                                     \
+                DISTI_STRIP(gemm, isa, out, R, W, (g, n, c, from, to, ahead))                                          \
             }                                                                                                          \
         } while (to < count);                                                                                          \
+        if (!g->mask || g->columns == DISTI_BLOCK) return;                                                             \
+        for (int o = 0; o < out; o++) g->mask[o] &= ((uint64_t)1 << g->columns) - 1;                                   \
     }                                                                                                                  \
     DISTI_FUNCTION void disti_gemm_back_##isa(const disti_gemm_back *g)                                                \
     {                                                                                                                  \
@@ -1677,63 +1697,54 @@ static void disti_outer_scalar(const float *w, const float *s, const int *alive,
         do {                                                                                                           \
             const int from = to;                                                                                       \
             to = DISTI_MIN(from + DISTI_DEPTH, count);                                                                 \
-            for (int n = 0; n < rows; n += 8) {                                                                        \
-                const int left = rows - n;                                                                             \
+            for (int c = 0; c < g->columns; c += W * DISTI_LANES) {                                                    \
+                const int vectors = DISTI_VECTORS(g->columns - c);                                                     \
                 int k[8];                                                                                              \
-                for (int i = 0; i < 8; i++) {                                                                          \
-                    const int row = DISTI_MIN(n + i, rows - 1);                                                        \
-                    k[i] = g->alive_rows ? g->alive_rows[row] : row;                                                   \
-                }                                                                                                      \
-                for (int c = 0; c < g->columns; c += VW * DISTI_LANES) {                                               \
-                    const int vectors = DISTI_VECTORS(g->columns - c);                                                 \
-                    if (vectors >= VW)                                                                                 \
-                        DISTI_EIGHT(RW, left, disti_back_wide_##isa(g, k + i, left - i, c, from, to))                  \
-                    else if (vectors >= VM)                                                                            \
-                        DISTI_EIGHT(RM, left, disti_back_middle_##isa(g, k + i, left - i, c, from, to))                \
-                    else                                                                                               \
-                        DISTI_EIGHT(RN, left, disti_back_narrow_##isa(g, k + i, left - i, c, from, to))                \
-                }                                                                                                      \
+                DISTI_STRIP(back, isa, rows, R, W,                                                                     \
+                            (g, disti_back_rows(g, rows, n, k), left, c, from, to))                                    \
             }                                                                                                          \
         } while (to < count);                                                                                          \
     }                                                                                                                  \
     DISTI_FUNCTION void disti_gemm_weights_##isa(const disti_gemm_weights *g)                                          \
     {                                                                                                                  \
-        float packed[DISTI_BLOCK * VW * DISTI_LANES];                                                                  \
-        for (int k = 0; k < g->rows; k += VW * DISTI_LANES) {                                                          \
-            const int vectors = DISTI_MIN(DISTI_VECTORS(g->rows - k), VW);                                             \
+        float packed[DISTI_BLOCK * W * DISTI_LANES];                                                                   \
+        for (int k = 0; k < g->rows; k += W * DISTI_LANES) {                                                           \
+            const int vectors = DISTI_MIN(DISTI_VECTORS(g->rows - k), W);                                              \
             const float *x = g->xt + k;                                                                                \
             size_t x_stride = g->xt_stride;                                                                            \
             if (x_stride > 128) {                                                                                      \
                 const size_t bytes = (size_t)(vectors * DISTI_LANES) * sizeof(float);                                  \
-                x_stride = VW * DISTI_LANES;                                                                           \
+                x_stride = W * DISTI_LANES;                                                                            \
                 for (size_t c = 0; c < (size_t)(unsigned)g->columns; c++)                                              \
                     memcpy(packed + c * x_stride, x + c * g->xt_stride, bytes);                                        \
                 x = packed;                                                                                            \
             }                                                                                                          \
-            for (int o = 0; o < g->out; o += 8) {                                                                      \
-                const int left = g->out - o;                                                                           \
-                if (vectors >= VW)                                                                                     \
-                    DISTI_EIGHT(RW, left, disti_weights_wide_##isa(g, o + i, k, x, x_stride))                          \
-                else if (vectors >= VM)                                                                                \
-                    DISTI_EIGHT(RM, left, disti_weights_middle_##isa(g, o + i, k, x, x_stride))                        \
-                else                                                                                                   \
-                    DISTI_EIGHT(RN, left, disti_weights_narrow_##isa(g, o + i, k, x, x_stride))                        \
-            }                                                                                                          \
+            DISTI_STRIP(weights, isa, g->out, R, W, (g, n, k, x, x_stride))                                            \
         }                                                                                                              \
     }
 
-#define DISTI_KERNELS(isa, RW, VW, RM, VM, RN)                                                                         \
-    DISTI_GEMM_TILE(wide_##isa, RW, VW)                                                                                \
-    DISTI_GEMM_TILE(middle_##isa, RM, VM)                                                                              \
-    DISTI_GEMM_TILE(narrow_##isa, RN, 1)                                                                               \
-    DISTI_BACK_TILE(wide_##isa, RW, VW)                                                                                \
-    DISTI_BACK_TILE(middle_##isa, RM, VM)                                                                              \
-    DISTI_BACK_TILE(narrow_##isa, RN, 1)                                                                               \
-    DISTI_WEIGHTS_TILE(wide_##isa, RW, VW)                                                                             \
-    DISTI_WEIGHTS_TILE(middle_##isa, RM, VM)                                                                           \
-    DISTI_WEIGHTS_TILE(narrow_##isa, RN, 1)                                                                            \
+#define DISTI_KERNELS(isa, R, W)                                                                                       \
+    DISTI_GEMM_TILE(wide_##isa, R, W)                                                                                  \
+    DISTI_GEMM_TILE(middle_##isa, 8, 2)                                                                                \
+    DISTI_GEMM_TILE(narrow_##isa, 8, 1)                                                                                \
+    DISTI_BACK_TILE(wide_##isa, R, W)                                                                                  \
+    DISTI_BACK_TILE(middle_##isa, 8, 2)                                                                                \
+    DISTI_BACK_TILE(narrow_##isa, 8, 1)                                                                                \
+    DISTI_WEIGHTS_TILE(wide_##isa, R, W)                                                                               \
+    DISTI_WEIGHTS_TILE(middle_##isa, 8, 2)                                                                             \
+    DISTI_WEIGHTS_TILE(narrow_##isa, 8, 1)                                                                             \
     DISTI_LAST_LAYER(isa)                                                                                              \
-    DISTI_DRIVERS(isa, RW, VW, RM, VM, RN)
+    DISTI_DRIVERS(isa, R, W)
+
+/* The eight rows of d_x that begin at the list's entry n; beyond its end the last one again. */
+static const int *disti_back_rows(const disti_gemm_back *g, int rows, int n, int *k)
+{
+    for (int i = 0; i < 8; i++) {
+        const int row = DISTI_MIN(n + i, rows - 1);
+        k[i] = g->alive_rows ? g->alive_rows[row] : row;
+    }
+    return k;
+}
 
 #ifdef DISTI_X86
 #define DISTI_PREFETCH(p) _mm_prefetch(p, _MM_HINT_T0)
@@ -1748,6 +1759,7 @@ static void disti_outer_scalar(const float *w, const float *s, const int *alive,
 #define DISTI_FMA(a, b, c) _mm_add_ps(_mm_mul_ps(a, b), c)
 #define DISTI_RELU(v) _mm_max_ps(v, _mm_setzero_ps())
 #define DISTI_POSITIVE(v) (unsigned)_mm_movemask_ps(_mm_cmpgt_ps(v, _mm_setzero_ps()))
+#define DISTI_BITS(row, column, v) *(row) |= (uint64_t)DISTI_POSITIVE(v) << (column);
 #define DISTI_KEEP(v, bits) disti_keep_sse2(v, (int)((bits) & 0xf))
 DISTI_FUNCTION __m128 disti_keep_sse2(__m128 v, int bits)
 {
@@ -1755,7 +1767,7 @@ DISTI_FUNCTION __m128 disti_keep_sse2(__m128 v, int bits)
     return _mm_and_ps(v, _mm_castsi128_ps(_mm_cmpeq_epi32(_mm_and_si128(_mm_set1_epi32(bits), lane), lane)));
 }
 #define DISTI_DEPTH 112
-DISTI_KERNELS(sse2, 4, 2, 4, 2, 8)
+DISTI_KERNELS(sse2, 4, 2)
 #undef DISTI_FUNCTION
 #undef DISTI_VEC
 #undef DISTI_LANES
@@ -1767,6 +1779,7 @@ DISTI_KERNELS(sse2, 4, 2, 4, 2, 8)
 #undef DISTI_FMA
 #undef DISTI_RELU
 #undef DISTI_POSITIVE
+#undef DISTI_BITS
 #undef DISTI_KEEP
 
 #define DISTI_FUNCTION DISTI_TARGET("avx2,fma") DISTI_KERNEL static
@@ -1779,6 +1792,7 @@ DISTI_KERNELS(sse2, 4, 2, 4, 2, 8)
 #define DISTI_FMA(a, b, c) _mm256_fmadd_ps(a, b, c)
 #define DISTI_RELU(v) _mm256_max_ps(v, _mm256_setzero_ps())
 #define DISTI_POSITIVE(v) (unsigned)_mm256_movemask_ps(_mm256_cmp_ps(v, _mm256_setzero_ps(), _CMP_GT_OQ))
+#define DISTI_BITS(row, column, v) ((unsigned char *)(row))[(column) / 8] = (unsigned char)DISTI_POSITIVE(v);
 #define DISTI_KEEP(v, bits) disti_keep_avx2(v, (int)((bits) & 0xff))
 DISTI_FUNCTION __m256 disti_keep_avx2(__m256 v, int bits)
 {
@@ -1786,8 +1800,8 @@ DISTI_FUNCTION __m256 disti_keep_avx2(__m256 v, int bits)
     const __m256i both = _mm256_and_si256(_mm256_set1_epi32(bits), lane);
     return _mm256_and_ps(v, _mm256_castsi256_ps(_mm256_cmpeq_epi32(both, lane)));
 }
-#define DISTI_DEPTH 112
-DISTI_KERNELS(avx2, 4, 3, 4, 2, 8)
+#define DISTI_DEPTH 512
+DISTI_KERNELS(avx2, 4, 3)
 #undef DISTI_FUNCTION
 #undef DISTI_VEC
 #undef DISTI_LANES
@@ -1799,6 +1813,7 @@ DISTI_KERNELS(avx2, 4, 3, 4, 2, 8)
 #undef DISTI_FMA
 #undef DISTI_RELU
 #undef DISTI_POSITIVE
+#undef DISTI_BITS
 #undef DISTI_KEEP
 
 #define DISTI_FUNCTION DISTI_TARGET("avx512f,avx512bw,avx512dq,avx512vl,fma") DISTI_KERNEL static
@@ -1812,9 +1827,10 @@ DISTI_KERNELS(avx2, 4, 3, 4, 2, 8)
 /* Unmasked, gcc 12 warns in C++ that its own header uses an uninitialized variable. */
 #define DISTI_RELU(v) _mm512_maskz_max_ps((__mmask16)0xffff, v, _mm512_setzero_ps())
 #define DISTI_POSITIVE(v) _mm512_cmp_ps_mask(v, _mm512_setzero_ps(), _CMP_GT_OQ)
+#define DISTI_BITS(row, column, v) { const __mmask16 m = DISTI_POSITIVE(v); memcpy((char *)(row) + (column) / 8, &m, 2); }
 #define DISTI_KEEP(v, bits) _mm512_maskz_mov_ps((__mmask16)((bits) & 0xffff), v)
 #define DISTI_DEPTH 512
-DISTI_KERNELS(avx512, 8, 3, 8, 2, 8)
+DISTI_KERNELS(avx512, 8, 3)
 #endif
 
 #ifdef DISTI_NEON
@@ -1827,7 +1843,7 @@ DISTI_KERNELS(avx512, 8, 3, 8, 2, 8)
 /* The factors of a tile come as lanes of two vectors instead of eight broadcasts. */
 #undef DISTI_SIDE
 #define DISTI_MAC_LANE(i, j) a##i##j = vfmaq_laneq_f32(a##i##j, x##j, b, (i) & 3);
-#define DISTI_SIDE(i, V) { const float32x4_t b = vld1q_f32(w + ((i) & 4)); DISTI_X##V(DISTI_MAC_LANE, i) }
+#define DISTI_SIDE(i, V) { const float32x4_t b = vld1q_f32(ws + ((i) & 4)); DISTI_X##V(DISTI_MAC_LANE, i) }
 
 #define DISTI_FUNCTION DISTI_KERNEL static
 #define DISTI_VEC float32x4_t
@@ -1839,6 +1855,7 @@ DISTI_KERNELS(avx512, 8, 3, 8, 2, 8)
 #define DISTI_FMA(a, b, c) vfmaq_f32(c, a, b)
 #define DISTI_RELU(v) disti_relu_neon(v)
 #define DISTI_POSITIVE(v) disti_positive_neon(v)
+#define DISTI_BITS(row, column, v) *(row) |= (uint64_t)DISTI_POSITIVE(v) << (column);
 #define DISTI_KEEP(v, bits) disti_keep_neon(v, (uint32_t)((bits) & 0xf))
 static float32x4_t disti_relu_neon(float32x4_t v)
 {
@@ -1856,7 +1873,7 @@ static float32x4_t disti_keep_neon(float32x4_t v, uint32_t bits)
     return vreinterpretq_f32_u32(vandq_u32(vreinterpretq_u32_f32(v), vtstq_u32(vdupq_n_u32(bits), vld1q_u32(lane))));
 }
 #define DISTI_DEPTH 112
-DISTI_KERNELS(neon, 8, 3, 8, 2, 8)
+DISTI_KERNELS(neon, 8, 3)
 #endif
 #endif
 
@@ -1902,9 +1919,9 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_SIDE
 #undef DISTI_APART
 #undef DISTI_STEP
+#undef DISTI_FENCE
 #undef DISTI_AHEAD
 #undef DISTI_VECTORS
-#undef DISTI_BITS1
 #undef DISTI_STORE_RELU1
 #undef DISTI_STORE_SUM1
 #undef DISTI_STORE_SUM
@@ -1924,7 +1941,7 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_WEIGHTS_TILE
 #undef DISTI_OUTER1
 #undef DISTI_LAST_LAYER
-#undef DISTI_EIGHT
+#undef DISTI_STRIP
 #undef DISTI_DRIVERS
 #undef DISTI_KERNELS
 #undef DISTI_PREFETCH
@@ -1938,6 +1955,7 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_FMA
 #undef DISTI_RELU
 #undef DISTI_POSITIVE
+#undef DISTI_BITS
 #undef DISTI_KEEP
 #undef DISTI_DEPTH
 #undef DISTI_MAC_LANE

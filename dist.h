@@ -1662,14 +1662,17 @@ static void disti_outer_scalar(const float *w, const float *s, const int *alive,
         }                                                                                                              \
     }
 
-/* All tiles of `total` rows in one strip of columns: R rows at a time where the strip is W vectors wide, else eight. */
-#define DISTI_STRIP(kernel, isa, total, R, W, arguments)                                                               \
-    for (int n = 0; n < (total); n += vectors >= W ? R : 8) {                                                          \
-        const int left = (total) - n;                                                                                  \
-        (void)left;                                                                                                    \
-        if (vectors >= W) disti_##kernel##_wide_##isa arguments;                                                       \
-        else if (vectors == 2) disti_##kernel##_middle_##isa arguments;                                                \
-        else disti_##kernel##_narrow_##isa arguments;                                                                  \
+/* All tiles of `total` rows, eight at a time: their strips are R rows high where W vectors wide, else eight. */
+#define DISTI_EACH(kernel, isa, total, columns, R, W, arguments)                                                       \
+    for (int row = 0; row < (total); row += 8) {                                                                       \
+        for (int c = 0; c < (columns); c += W * DISTI_LANES) {                                                         \
+            const int vectors = DISTI_VECTORS((columns) - c);                                                          \
+            for (int n = row; n < row + 8 && n < (total); n += vectors >= W ? R : 8) {                                 \
+                if (vectors >= W) disti_##kernel##_wide_##isa arguments;                                               \
+                else if (vectors == 2) disti_##kernel##_middle_##isa arguments;                                        \
+                else disti_##kernel##_narrow_##isa arguments;                                                          \
+            }                                                                                                          \
+        }                                                                                                              \
     }
 #define DISTI_DRIVERS(isa, R, W)                                                                                       \
     DISTI_FUNCTION void disti_gemm_##isa(const disti_gemm *g)                                                          \
@@ -1681,10 +1684,7 @@ static void disti_outer_scalar(const float *w, const float *s, const int *alive,
         do {                                                                                                           \
             const int from = to;                                                                                       \
             to = DISTI_MIN(from + DISTI_DEPTH, count);                                                                 \
-            for (int c = 0; c < g->columns; c += W * DISTI_LANES) {                                                    \
-                const int vectors = DISTI_VECTORS(g->columns - c);                                                     \
-                DISTI_STRIP(gemm, isa, out, R, W, (g, n, c, from, to, ahead))                                          \
-            }                                                                                                          \
+            DISTI_EACH(gemm, isa, out, g->columns, R, W, (g, n, c, from, to, ahead))                                   \
         } while (to < count);                                                                                          \
         if (!g->mask || g->columns == DISTI_BLOCK) return;                                                             \
         for (int o = 0; o < out; o++) g->mask[o] &= ((uint64_t)1 << g->columns) - 1;                                   \
@@ -1693,33 +1693,28 @@ static void disti_outer_scalar(const float *w, const float *s, const int *alive,
     {                                                                                                                  \
         const int rows = g->alive_rows ? g->alive_rows_count : g->rows;                                                \
         const int count = g->alive_out ? g->alive_out_count : g->out;                                                  \
-        int to = 0;                                                                                                    \
+        int to = 0, k[8];                                                                                              \
         do {                                                                                                           \
             const int from = to;                                                                                       \
             to = DISTI_MIN(from + DISTI_DEPTH, count);                                                                 \
-            for (int c = 0; c < g->columns; c += W * DISTI_LANES) {                                                    \
-                const int vectors = DISTI_VECTORS(g->columns - c);                                                     \
-                int k[8];                                                                                              \
-                DISTI_STRIP(back, isa, rows, R, W,                                                                     \
-                            (g, disti_back_rows(g, rows, n, k), left, c, from, to))                                    \
-            }                                                                                                          \
+            DISTI_EACH(back, isa, rows, g->columns, R, W, (g, disti_back_rows(g, rows, n, k), rows - n, c, from, to))  \
         } while (to < count);                                                                                          \
     }                                                                                                                  \
     DISTI_FUNCTION void disti_gemm_weights_##isa(const disti_gemm_weights *g)                                          \
     {                                                                                                                  \
         float packed[DISTI_BLOCK * W * DISTI_LANES];                                                                   \
         for (int k = 0; k < g->rows; k += W * DISTI_LANES) {                                                           \
-            const int vectors = DISTI_MIN(DISTI_VECTORS(g->rows - k), W);                                              \
+            const int floats = DISTI_MIN(g->rows - k, W * DISTI_LANES);                                                \
             const float *x = g->xt + k;                                                                                \
             size_t x_stride = g->xt_stride;                                                                            \
             if (x_stride > 128) {                                                                                      \
-                const size_t bytes = (size_t)(vectors * DISTI_LANES) * sizeof(float);                                  \
+                const size_t bytes = (size_t)(DISTI_VECTORS(floats) * DISTI_LANES) * sizeof(float);                    \
                 x_stride = W * DISTI_LANES;                                                                            \
                 for (size_t c = 0; c < (size_t)(unsigned)g->columns; c++)                                              \
                     memcpy(packed + c * x_stride, x + c * g->xt_stride, bytes);                                        \
                 x = packed;                                                                                            \
             }                                                                                                          \
-            DISTI_STRIP(weights, isa, g->out, R, W, (g, n, k, x, x_stride))                                            \
+            DISTI_EACH(weights, isa, g->out, floats, R, W, (g, n, k, x, x_stride))                                     \
         }                                                                                                              \
     }
 
@@ -1941,7 +1936,7 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_WEIGHTS_TILE
 #undef DISTI_OUTER1
 #undef DISTI_LAST_LAYER
-#undef DISTI_STRIP
+#undef DISTI_EACH
 #undef DISTI_DRIVERS
 #undef DISTI_KERNELS
 #undef DISTI_PREFETCH

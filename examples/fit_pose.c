@@ -25,7 +25,7 @@ static const char usage[] =
     "  --seed S           of all that is chosen by chance (default 1)\n"
     "  --iterations N     steps of Adam, the first three quarters in a coarser picture (default 80)\n"
     "  --refine N         steps of Gauss and Newton after them (default 10)\n"
-    "  --restarts N       as long as the picture is not explained, do it again from 10 degrees beside (default 5)\n"
+    "  --restarts N       as long as the picture is not explained, try again, 10 degrees beside (default 5)\n"
     "  --rate R           of Adam, at the start (default 0.03)\n"
     "  --weights D,S,0    of depth and silhouette (default 10,100,0)\n"
     "  --gradient WHICH   implicit (default), paper, normal or auto; see the README\n"
@@ -336,19 +336,20 @@ static int fit_once(fit *f, record *records)
 static int is_explained(const fit *f, score *s)
 {
     *s = score_pictures(f->seen, f->levels[1].out.depth, f->levels[1].out.mask);
-    return s->depth_error >= 0 && s->depth_error < 1e-3 && s->iou > 0.995;
+    return s->depth_error >= 0 && s->depth_error < 1e-4 && s->iou > 0.999;
 }
 
 /* Depth and silhouette of some shapes have several minima, as the legs of a table that is turned: a result that does
-   not explain the picture is a start to be tried again beside it, and the best result is kept.
+   not explain the picture is tried again, from beside the best result and from beside the start in turn.
    records: (restarts + 1) times fit_once's. Returns how many there are; the last is of the result. */
 static int fit_run(fit *f, record *records)
 {
+    dist_camera start = f->camera;
     int count = fit_once(f, records);
     record best = records[count - 1];
     score s;
     for (int i = 0; i < f->asked->restarts && !is_explained(f, &s); i++) {
-        f->camera = best.camera;
+        f->camera = i % 2 ? start : best.camera;
         camera_off(&f->camera, 10.0, 0.05, &f->random);
         count += fit_once(f, records + count);
         if (records[count - 1].loss < best.loss) { best = records[count - 1]; }

@@ -2668,8 +2668,10 @@ DIST_API dist_status dist_color_backward(dist_context *ctx, const dist_field *fi
     if (grads->weights && (field->color_weight_count > 0 || !field->color_weights_fn))
         return disti_fail(ctx, DIST_UNSUPPORTED, "%s: grads.weights is given, but the color is not of the shape's net",
                           name, 0, 0);
+    if (grads->code && field->code_size == 0)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: grads.code is given, but the field has no code", name, 0, 0);
     mine = *grads;
-    mine.weights = NULL; /* a texture by itself has weights, but no weights_fn: that is the distance's */
+    mine.code = mine.weights = NULL; /* a texture by itself has both, but no adjoint_fn, weights_fn of a distance */
     status = disti_gradients_check(ctx, field, &mine, name);
     if (status != DIST_OK || n == 0) return status;
     if (!points || !d_color)

@@ -611,4 +611,47 @@ static inline void shape_make(shape *s, int family, unsigned index)
     shape_fit(s);
 }
 
+/* ---- color ------------------------------------------------------------------------------------------------------- */
+
+enum { SHAPE_COLORINGS = 64 };
+
+/* What a coloring is made of: two hues on the color circle, and waves along three directions. */
+typedef struct shape_coloring {
+    float hue, contrast;
+    float wave[3][3], phase[3]; /* sin(wave . p + phase) */
+} shape_coloring;
+
+/* Coloring `index`, the same for every shape but for a turn of the hue by family. */
+static inline shape_coloring shape_coloring_make(int family, unsigned index)
+{
+    static const float way[3][3] = {{0.15f, 1.0f, 0.1f}, {1.0f, -0.1f, 0.35f}, {-0.3f, 0.2f, 1.0f}};
+    static const float period[3] = {0.45f, 0.7f, 1.1f};
+    shape_coloring c;
+    uint64_t state = 7777u + index;
+    shape_random(&state);
+    c.hue = shape_pick(&state, 0.0f, 6.2831853f) + 0.4f * (float)family;
+    c.contrast = shape_pick(&state, 1.5f, 3.5f);
+    for (int i = 0; i < 3; i++) {
+        float frequency = 6.2831853f / (period[i] * shape_pick(&state, 0.85f, 1.15f));
+        for (int k = 0; k < 3; k++) c.wave[i][k] = frequency * way[i][k];
+        c.phase[i] = shape_pick(&state, 0.0f, 6.2831853f);
+    }
+    return c;
+}
+
+/* Smooth, within 0.03 and 0.97: the first wave goes from one hue to the other, the second and third are light and
+   dark. */
+static inline void shape_color(const shape_coloring *c, const float p[3], float rgb[3])
+{
+    float s[3];
+    for (int i = 0; i < 3; i++)
+        s[i] = sinf(c->wave[i][0] * p[0] + c->wave[i][1] * p[1] + c->wave[i][2] * p[2] + c->phase[i]);
+    float mix = 0.5f + 0.5f * s[0], light = 0.5f + 0.13f * s[1] + 0.1f * s[2];
+    for (int k = 0; k < 3; k++) {
+        float third = 2.0943951f * (float)k;
+        float tint = (1.0f - mix) * cosf(c->hue - third) + mix * cosf(c->hue + c->contrast - third);
+        rgb[k] = light + 0.24f * tint;
+    }
+}
+
 #endif

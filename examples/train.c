@@ -16,13 +16,14 @@
 static const char usage[] =
     "train [options] --out FILE.safetensors     trains a decoder\n"
     "train --evaluate FILE.safetensors          measures one: Chamfer distance x 1000, as csv\n"
+    "train --color SHAPES.safetensors --out FILE.safetensors     trains a texture for a decoder made by the first\n"
     "\n"
     "  --families LIST    of sofas,planes,tables,cars (default all; for --evaluate those it was trained on)\n"
     "  --shapes N         shapes of each family (default 64)\n"
-    "  --layers N         hidden layers (default 5)\n"
-    "  --width N          units of each (default 128)\n"
-    "  --code N           numbers of a code (default 32)\n"
-    "  --steps N          steps of Adam (default 20000)\n"
+    "  --layers N         hidden layers (default 5; a texture: 3)\n"
+    "  --width N          units of each (default 128; a texture: 64)\n"
+    "  --code N           numbers of a code (default 32; a texture: 8 beside the shape's)\n"
+    "  --steps N          steps of Adam (default 20000; a texture: 6000)\n"
     "  --epochs N         the same in passes over all shapes\n"
     "  --minutes M        the same by the clock: not reproducible\n"
     "  --group N          shapes a step (default 64)\n"
@@ -36,6 +37,8 @@ static const char usage[] =
     "  --resume FILE      goes on with a model's weights and codes\n"
     "  --out FILE         where the model goes\n"
     "  --header FILE.h    the same as C source\n"
+    "  --color FILE       trains a texture for this decoder of the same families and number of shapes: colorings of\n"
+    "                     shapes.h, any of them on any shape, one color code each\n"
     "  --evaluate FILE    measures instead of training\n"
     "  --count N          training shapes of each family that are measured (default 16)\n"
     "  --held-out N       shapes of each family that were never seen, fitted and measured (default 16; training: 0)\n"
@@ -51,7 +54,7 @@ typedef struct settings {
     unsigned seed;
     double minutes;
     float rate, code_rate, prior;
-    const char *resume, *out, *header, *evaluate;
+    const char *resume, *out, *header, *evaluate, *color;
 } settings;
 
 /* ---- samples
@@ -390,8 +393,8 @@ static void train(dist_context *ctx, const settings *how, trainer *t)
            sqrt(squares / (double)t->shape_count));
 }
 
-/* The model file as little-endian words, for programs that carry it with them. */
-static void write_header(dist_context *ctx, const dist_net *net, const char *path)
+/* The model file as little-endian words, for programs that carry it with them. what: "model" or "texture". */
+static void write_header(dist_context *ctx, const dist_net *net, const char *what, const char *path)
 {
     size_t size = 0;
     dist_net_save(ctx, net, NULL, 0, &size);
@@ -400,11 +403,11 @@ static void write_header(dist_context *ctx, const dist_net *net, const char *pat
     check(ctx);
     make_folders(path);
     FILE *file = open_file(path, "wb");
-    fprintf(file,
-            "/* made by examples/train.c: a decoder of %d shapes, as a safetensors file in little-endian words */\n",
-            dist_net_code_count(net));
-    fprintf(file, "static const unsigned long model_bytes = %luul;\nstatic const unsigned model_words[] = {\n",
-            (unsigned long)size);
+    fprintf(file, "/* made by examples/train.c: %s of %d %s, as a safetensors file in little-endian words */\n",
+            strcmp(what, "model") == 0 ? "a decoder" : "a texture", dist_net_code_count(net),
+            strcmp(what, "model") == 0 ? "shapes" : "colorings");
+    fprintf(file, "static const unsigned long %s_bytes = %luul;\nstatic const unsigned %s_words[] = {\n", what,
+            (unsigned long)size, what);
     for (size_t i = 0; i < size; i += 4) {
         unsigned long word = (unsigned long)bytes[i] | (unsigned long)bytes[i + 1] << 8 |
                              (unsigned long)bytes[i + 2] << 16 | (unsigned long)bytes[i + 3] << 24;
@@ -413,6 +416,170 @@ static void write_header(dist_context *ctx, const dist_net *net, const char *pat
     fputs("\n};\n", file);
     close_file(file, path);
     free(bytes);
+}
+
+/* ---- texture ----------------------------------------------------------------------------------------------------- */
+
+/* rgb = g(shape code, color code, point), learned on points about the surfaces with the decoder's own codes held still.
+   Every step pairs shapes with colorings at random, so that either code can go with any other. */
+typedef struct painter {
+    dist_net *net;
+    dist_shape *shape;
+    pool *pools;
+    size_t shape_count, own, size; /* numbers of the shape's code, and of both codes */
+    float *codes;                  /* (SHAPE_COLORINGS, size - own) */
+    float *weights, *d_weights, *d_code, *code;
+    float *points, *color, *target, *d_color;
+    dist_adam adam, code_adam[SHAPE_COLORINGS];
+    rng random;
+} painter;
+
+static void painter_begin(painter *t, dist_context *ctx, const settings *how, const dist_net *decoder)
+{
+    dist_net_desc desc;
+    memset(t, 0, sizeof *t);
+    memset(&desc, 0, sizeof desc);
+    t->own = (size_t)dist_net_code_size(decoder);
+    t->size = t->own + (size_t)how->code;
+    t->shape_count = (size_t)(how->shapes * how->family_count);
+    if (dist_net_code_count(decoder) != (int)t->shape_count)
+        fail("the decoder has %d codes, not %d of each of %d families", dist_net_code_count(decoder), how->shapes,
+             how->family_count);
+    desc.layers = how->layers;
+    desc.width = how->width;
+    desc.code_size = (int)t->size;
+    desc.code_count = SHAPE_COLORINGS;
+    desc.activation = DIST_ACTIVATION_SINE;
+    desc.color = 1;
+    desc.seed = how->seed;
+    t->net = dist_net_create(ctx, &desc);
+    check(ctx);
+    t->random = rng_begin(how->seed);
+    t->pools = (pool *)take(t->shape_count, sizeof *t->pools);
+    progress p = progress_begin("sampling the shapes");
+    for (size_t k = 0; k < t->shape_count; k++) {
+        t->pools[k] = pool_make(ctx, how->families[k / (size_t)how->shapes], (unsigned)(k % (size_t)how->shapes),
+                                (size_t)how->pool);
+        progress_show(&p, (double)k, (double)t->shape_count, NULL, 0);
+    }
+    progress_end(&p);
+    size_t count = dist_net_weight_count(t->net), batch = (size_t)how->batch, extra = t->size - t->own;
+    t->weights = take_floats(count);
+    memcpy(t->weights, dist_net_weights(t->net), count * sizeof(float));
+    t->d_weights = take_floats(count);
+    t->adam.moments = take_floats(2 * count);
+    t->codes = take_floats(SHAPE_COLORINGS * extra);
+    for (size_t i = 0; i < SHAPE_COLORINGS; i++) t->code_adam[i].moments = take_floats(2 * extra);
+    for (size_t i = 0; i < SHAPE_COLORINGS * extra; i++) t->codes[i] = 0.5f * rng_normal(&t->random);
+    t->d_code = take_floats(t->size);
+    t->code = take_floats(t->size);
+    t->points = take_floats(12 * batch);
+    t->color = t->points + 3 * batch;
+    t->target = t->color + 3 * batch;
+    t->d_color = t->target + 3 * batch;
+    t->shape = dist_shape_create(ctx, t->net, NULL);
+    check(ctx);
+}
+
+static void painter_end(painter *t)
+{
+    for (size_t k = 0; k < t->shape_count; k++) pool_free(&t->pools[k]);
+    for (size_t i = 0; i < SHAPE_COLORINGS; i++) free(t->code_adam[i].moments);
+    free(t->adam.moments);
+    free(t->pools);
+    free(t->weights);
+    free(t->d_weights);
+    free(t->codes);
+    free(t->d_code);
+    free(t->code);
+    free(t->points);
+    dist_shape_destroy(t->shape);
+    dist_net_destroy(t->net);
+}
+
+/* A shape in a coloring: both codes into the shape, points with the colors they should have and those they have. */
+static void painter_draw(painter *t, dist_context *ctx, const settings *how, const dist_net *decoder, size_t k,
+                         size_t coloring)
+{
+    size_t batch = (size_t)how->batch, extra = t->size - t->own;
+    const pool *from = &t->pools[k];
+    shape_coloring c = shape_coloring_make(how->families[k / (size_t)how->shapes], (unsigned)coloring);
+    for (size_t i = 0; i < batch; i++) {
+        memcpy(t->points + 3 * i, from->points + 3 * rng_index(&t->random, from->count), 3 * sizeof(float));
+        shape_color(&c, t->points + 3 * i, t->target + 3 * i);
+    }
+    memcpy(t->code, dist_net_code(decoder, (int)k), t->own * sizeof(float));
+    memcpy(t->code + t->own, t->codes + coloring * extra, extra * sizeof(float));
+    dist_shape_set_code(t->shape, t->code);
+    dist_field field = dist_shape_field(t->shape);
+    dist_color_eval(ctx, &field, batch, t->points, t->color);
+}
+
+static double painter_step(painter *t, dist_context *ctx, const settings *how, const dist_net *decoder, double done)
+{
+    size_t batch = (size_t)how->batch, extra = t->size - t->own, count = dist_net_weight_count(t->net);
+    float decay = 0.5f + 0.5f * cosf(PI * (float)done) + 1e-3f;
+    double loss = 0.0;
+    dist_gradients grads;
+    memset(&grads, 0, sizeof grads);
+    grads.code = t->d_code;
+    grads.weights = t->d_weights;
+    memset(t->d_weights, 0, count * sizeof(float));
+    for (int i = 0; i < how->group; i++) {
+        size_t coloring = rng_index(&t->random, SHAPE_COLORINGS);
+        painter_draw(t, ctx, how, decoder, rng_index(&t->random, t->shape_count), coloring);
+        memset(t->d_color, 0, 3 * batch * sizeof(float));
+        memset(t->d_code, 0, t->size * sizeof(float));
+        loss += (double)dist_loss_color(batch, t->color, t->target, NULL, 1.0f, t->d_color) / how->group;
+        dist_loss_code(extra, t->codes + coloring * extra, how->prior, t->d_code + t->own);
+        dist_field field = dist_shape_field(t->shape);
+        dist_color_backward(ctx, &field, batch, t->points, t->d_color, NULL, &grads);
+        t->code_adam[coloring].rate = how->code_rate * decay;
+        dist_adam_step(&t->code_adam[coloring], extra, t->codes + coloring * extra, t->d_code + t->own);
+    }
+    t->adam.rate = how->rate * decay;
+    dist_adam_step(&t->adam, count, t->weights, t->d_weights);
+    dist_net_set_weights(ctx, t->net, t->weights);
+    check(ctx);
+    return loss;
+}
+
+/* Trains, stores with coloring i the code of shape i * shapes / colorings before its own, and writes. */
+static void paint(dist_context *ctx, const settings *how)
+{
+    painter t;
+    dist_net *decoder = dist_net_load_file(ctx, how->color);
+    check(ctx);
+    painter_begin(&t, ctx, how, decoder);
+    double began = seconds_now(), done = 0.0, loss = 0.0, squares = 0.0;
+    int step = 0;
+    progress p = progress_begin("training");
+    for (; done < 1.0; step++) {
+        double now = painter_step(&t, ctx, how, decoder, done), keep = step < 200 ? (double)step / (step + 1) : 0.995;
+        loss = keep * loss + (1.0 - keep) * now;
+        done = how->minutes > 0.0 ? (seconds_now() - began) / (60.0 * how->minutes) : (step + 1.0) / how->steps;
+        progress_show(&p, done, 1.0, "loss", loss);
+    }
+    progress_end(&p);
+    for (size_t i = 0; i < t.shape_count; i++) { /* every shape once, in a coloring that is not its own by number */
+        painter_draw(&t, ctx, how, decoder, i, (i * 7 + 3) % SHAPE_COLORINGS);
+        for (size_t j = 0; j < 3 * (size_t)how->batch; j++)
+            squares += ((double)t.color[j] - (double)t.target[j]) * ((double)t.color[j] - (double)t.target[j]);
+    }
+    for (size_t i = 0; i < SHAPE_COLORINGS; i++) {
+        memcpy(t.code, dist_net_code(decoder, (int)(i * t.shape_count / SHAPE_COLORINGS)), t.own * sizeof(float));
+        memcpy(t.code + t.own, t.codes + i * (t.size - t.own), (t.size - t.own) * sizeof(float));
+        dist_net_set_code(ctx, t.net, (int)i, t.code);
+    }
+    make_folders(how->out);
+    dist_net_save_file(ctx, t.net, how->out);
+    check(ctx);
+    if (how->header) write_header(ctx, t.net, "texture", how->header);
+    printf("%d colorings, %.0f weights, %d steps in %.0f s: loss %.5f, %.1f dB on every shape\n", SHAPE_COLORINGS,
+           (double)dist_net_weight_count(t.net), step, seconds_now() - began, loss,
+           -10.0 * log10(squares / (3.0 * (double)t.shape_count * how->batch)));
+    painter_end(&t);
+    dist_net_destroy(decoder);
 }
 
 /* ---- evaluation
@@ -588,6 +755,7 @@ static int parse_training(options *o, settings *how)
     else if (option_is(o, "--resume")) how->resume = option_text(o);
     else if (option_is(o, "--out")) how->out = option_text(o);
     else if (option_is(o, "--header")) how->header = option_text(o);
+    else if (option_is(o, "--color")) how->color = option_text(o);
     else return 0;
     return 1;
 }
@@ -598,10 +766,6 @@ static settings parse(int argc, char **argv)
     memset(&how, 0, sizeof how);
     for (int i = 0; i < SHAPE_FAMILIES; i++) how.families[how.family_count++] = i;
     how.shapes = 64;
-    how.layers = 5;
-    how.width = 128;
-    how.code = 32;
-    how.steps = 20000;
     how.group = 64;
     how.batch = 256;
     how.pool = 24000;
@@ -630,6 +794,10 @@ static settings parse(int argc, char **argv)
         else if (option_is(&o, "--iterations")) how.iterations = option_int(&o, 1, 1000000);
         else option_unknown(&o);
     }
+    if (!how.layers) how.layers = how.color ? 3 : 5;
+    if (!how.width) how.width = how.color ? 64 : 128;
+    if (!how.code) how.code = how.color ? 8 : 32;
+    if (!how.steps) how.steps = how.color ? 6000 : 20000;
     if (!how.evaluate && !how.out) fail("--out FILE.safetensors is missing; --help lists the options");
     if (how.evaluate && how.out) fail("--evaluate measures a model, --out trains one: choose one of them");
     return how;
@@ -649,13 +817,15 @@ int main(int argc, char **argv)
         check(ctx);
         evaluate(ctx, &how, net);
         dist_net_destroy(net);
+    } else if (how.color) {
+        paint(ctx, &how);
     } else {
         trainer t;
         train(ctx, &how, &t);
         make_folders(how.out);
         dist_net_save_file(ctx, t.net, how.out);
         check(ctx);
-        if (how.header) write_header(ctx, t.net, how.header);
+        if (how.header) write_header(ctx, t.net, "model", how.header);
         if (how.held_out > 0) evaluate(ctx, &how, t.net);
         trainer_end(&t);
     }

@@ -492,10 +492,11 @@ TEST(a_texture_net_is_created_saved_and_trained)
     dist_net *net = dist_net_create(ctx, &desc);
     REQUIRE(net != NULL && dist_net_channels(net) == 3);
     size_t count = dist_net_weight_count(net);
-    float *weights = (float *)calloc(4 * count, sizeof(float)), code[3] = {0.3f, -0.1f, 0.2f};
+    float *weights = (float *)calloc(4 * count, sizeof(float)), code[3] = {0.3f, -0.1f, 0.2f}, d_code[3] = {0, 0, 0};
     memcpy(weights, dist_net_weights(net), count * sizeof(float));
     adam.moments = weights + count;
     grads.weights = weights + 3 * count;
+    grads.code = d_code;
     dist_shape *shape = dist_shape_create(ctx, net, code);
     dist_field field = dist_shape_field(shape);
     test_random_fill(&random, 3 * POINTS, points, -0.8f, 0.8f);
@@ -512,6 +513,7 @@ TEST(a_texture_net_is_created_saved_and_trained)
         dist_shape_set_code(shape, code);
     }
     CHECK(last < 0.2f * first);
+    CHECK(d_code[0] < 0 || d_code[0] > 0);
     CHECK_STATUS(DIST_OK, dist_net_save(ctx, net, NULL, 0, &size), ctx);
     bytes = (unsigned char *)malloc(size);
     CHECK_STATUS(DIST_OK, dist_net_save(ctx, net, bytes, size, &size), ctx);

@@ -199,9 +199,10 @@ typedef struct dist_field {
        dL/d(color code) to d_color_code; each is NULL where it is not wanted. NULL: the color has no adjoint. */
     void (*color_adjoint_fn)(void *user, int worker, size_t n, const float *points, const float *d_color,
                              float *d_points, double *d_code, double *d_color_code);
-    /* Set by dist_shape_field: adds dL/dweights of the net that gives the color. */
+    /* Set by dist_shape_field: the same for all n points at once, d_code followed by d_color_code in one array, and
+       dL/dweights of the net that gives the color. */
     void (*color_weights_fn)(void *user, dist_context *ctx, size_t n, const float *points, const float *d_color,
-                             float *d_weights);
+                             float *d_points, double *d_code, float *d_weights);
     float center[3]; /* bounding sphere: the surface lies inside it, nothing is looked for outside */
     float radius;
     float lipschitz; /* bound or estimate of |grad f|; 0: 1 */
@@ -359,6 +360,7 @@ typedef struct dist_net_desc {
     int activation;   /* DIST_ACTIVATION_* */
     float scale;      /* beta of softplus, omega of sine; 0: 100, 30 */
     int output_linear;/* 0: tanh at the end, 1: nothing */
+    int levels;       /* Fourier levels beside the point: sin and cos of pi 2^k p, k below levels; at most 16 */
     int color;        /* 1: a texture: r, g, b in place of the distance, with a sigmoid at the end unless linear */
     int geometric; /* 1: starts near the distance to a sphere of half the bound (ReLU, softplus); 0: PyTorch's start */
     float bound;      /* 0: 1 */
@@ -2469,29 +2471,39 @@ static void disti_field_fused(const dist_field *field, int worker, size_t n, con
 }
 
 #ifndef DIST_NO_BACKWARD
-/* dist_color_backward behind the door: totals in double, in slot order. ctx->partial is large enough. */
+/* Where the weights of the color's net go: a texture's, or the shape's own. */
+static float *disti_color_weights(const dist_field *field, const dist_gradients *grads)
+{
+    if (!field->color_weights_fn) return NULL;
+    return field->color_weight_count > 0 ? grads->color_weights : grads->weights;
+}
+
+/* dist_color_backward behind the door: total (code_size + color_code_size), in double and in slot order, gets those of
+   the codes that grads wants. ctx->partial is large enough. */
 static void disti_color_backward_all(dist_context *ctx, const dist_field *field, size_t n, const float *points,
-                                     const float *d_color, float *d_points, double *d_code, double *d_color_code)
+                                     const float *d_color, float *d_points, const dist_gradients *grads, double *total)
 {
     disti_color_job job;
-    size_t code = (size_t)field->code_size, size = code + (size_t)field->color_code_size;
-    if (n == 0 || (!d_points && !d_code && !d_color_code)) return;
+    size_t size = (size_t)field->code_size + (size_t)field->color_code_size;
+    float *weights = disti_color_weights(field, grads);
+    int codes = grads->code || grads->color_code;
+    if (n == 0 || (!d_points && !codes && !weights)) return;
+    if (weights) {
+        field->color_weights_fn(field->user, ctx, n, points, d_color, d_points, codes ? total : NULL, weights);
+        return;
+    }
+    memset(&job, 0, sizeof job);
     job.field = field;
     job.pieces = disti_cut(n, DISTI_BLOCK, DISTI_SLOTS);
     job.points = points;
     job.d_color = d_color;
-    job.color = NULL;
     job.d_points = d_points;
     job.slots = ctx->partial;
-    job.code = d_code != NULL;
-    job.color_code = d_color_code != NULL;
+    job.code = grads->code != NULL;
+    job.color_code = grads->color_code != NULL;
     memset(ctx->partial, 0, (size_t)job.pieces.count * size * sizeof(double));
     disti_run(ctx, job.pieces.count, disti_color_task, &job);
-    for (size_t slot = 0; slot < (size_t)job.pieces.count; slot++) {
-        const double *part = ctx->partial + slot * size;
-        for (size_t j = 0; d_code && j < code; j++) d_code[j] += part[j];
-        for (size_t j = code; d_color_code && j < size; j++) d_color_code[j - code] += part[j];
-    }
+    for (size_t i = 0; codes && i < (size_t)job.pieces.count * size; i++) total[i % size] += ctx->partial[i];
 }
 
 /* One slot's share of dist_field_backward; d_code holds the slot's own sums. */
@@ -2647,13 +2659,6 @@ static int disti_gradients_camera(const dist_gradients *grads)
     return grads->rotation || grads->translation || grads->focal || grads->principal;
 }
 
-/* Where the weights of the color's net go: a texture's, or the shape's own. */
-static float *disti_color_weights(const dist_field *field, const dist_gradients *grads)
-{
-    if (!field->color_weights_fn) return NULL;
-    return field->color_weight_count > 0 ? grads->color_weights : grads->weights;
-}
-
 DIST_API dist_status dist_color_backward(dist_context *ctx, const dist_field *field, size_t n, const float *points,
                                          const float *d_color, float *d_points, const dist_gradients *grads)
 {
@@ -2681,10 +2686,7 @@ DIST_API dist_status dist_color_backward(dist_context *ctx, const dist_field *fi
     if (status != DIST_OK) return status;
     double *total = ctx->partial + (size_t)DISTI_SLOTS * size;
     memset(total, 0, size * sizeof(double));
-    disti_color_backward_all(ctx, field, n, points, d_color, d_points, grads->code ? total : NULL,
-                             grads->color_code ? total + code : NULL);
-    if (disti_color_weights(field, grads))
-        field->color_weights_fn(field->user, ctx, n, points, d_color, disti_color_weights(field, grads));
+    disti_color_backward_all(ctx, field, n, points, d_color, d_points, grads, total);
     for (size_t j = 0; grads->code && j < code; j++) grads->code[j] += (float)total[j];
     for (size_t j = code; grads->color_code && j < size; j++) grads->color_code[j - code] += (float)total[j];
     return DIST_OK;
@@ -5050,19 +5052,19 @@ static void disti_weights_block(void *arg, int index, int worker)
         pull = disti_second_block(shape, worker, &b, count, job->points + 3 * at, job->directions + 3 * at, store);
     } else {
         disti_block_begin(shape, worker, &b, count, job->points + 3 * at);
-        if (job->d_color) {
-            disti_color_reverse(shape, worker, &b, count, job->d_color + 3 * at, store);
-            return;
-        }
         float *value = b.tail, *slope = b.tail + DISTI_BLOCK, *seed = b.tail + 2 * DISTI_BLOCK,
               *g = b.tail + 8 * DISTI_BLOCK;
-        const float *x = disti_net_forward(shape, &b, store, disti_counter_of(shape->ctx, worker));
-        disti_net_output(shape, &b, x, net->sdf_channel, value, slope, NULL);
-        if (job->seed_fn) job->seed_fn(job->seed_user, at, count, value, NULL, seed);
-        else memcpy(seed, job->d_sdf + at, count * sizeof(float));
-        if (job->seed_fn && job->d_sdf) memcpy(job->d_sdf + at, seed, count * sizeof(float));
-        for (size_t c = 0; c < DISTI_BLOCK; c++) seed[c] = c < count ? seed[c] * slope[c] : 0.0f;
-        disti_net_reverse(shape, &b, seed, store);
+        if (job->d_color) {
+            disti_color_reverse(shape, worker, &b, count, job->d_color + 3 * at, store);
+        } else {
+            const float *x = disti_net_forward(shape, &b, store, disti_counter_of(shape->ctx, worker));
+            disti_net_output(shape, &b, x, net->sdf_channel, value, slope, NULL);
+            if (job->seed_fn) job->seed_fn(job->seed_user, at, count, value, NULL, seed);
+            else memcpy(seed, job->d_sdf + at, count * sizeof(float));
+            if (job->seed_fn && job->d_sdf) memcpy(job->d_sdf + at, seed, count * sizeof(float));
+            for (size_t c = 0; c < DISTI_BLOCK; c++) seed[c] = c < count ? seed[c] * slope[c] : 0.0f;
+            disti_net_reverse(shape, &b, seed, store);
+        }
         disti_encode_backward(net, &b, g);
         pull = g;
     }
@@ -5203,7 +5205,7 @@ static dist_status disti_shape_second_weights(void *user, dist_context *ctx, siz
 
 /* dist_field.color_weights_fn of a net. */
 static void disti_shape_color_weights_fn(void *user, dist_context *ctx, size_t n, const float *points,
-                                         const float *d_color, float *d_weights)
+                                         const float *d_color, float *d_points, double *d_code, float *d_weights)
 {
     disti_weights_job job;
     memset(&job, 0, sizeof job);
@@ -5211,8 +5213,9 @@ static void disti_shape_color_weights_fn(void *user, dist_context *ctx, size_t n
     job.n = n;
     job.points = points;
     job.d_color = d_color;
+    job.d_points = d_points;
     job.d_weights = d_weights;
-    disti_weights_run(&job, ctx, NULL);
+    disti_weights_run(&job, ctx, d_code);
 }
 #endif
 
@@ -6176,6 +6179,8 @@ static dist_status disti_net_desc_check(dist_context *ctx, const dist_net_desc *
     if (d->skip < 0 || d->skip >= d->layers)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: skip is %d, must be 0 or a hidden layer below %d", name, d->skip,
                           d->layers);
+    if (d->levels < 0 || d->levels > DISTI_MAX_LEVELS)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: levels is %d, must be 0 to 16", name, d->levels, 0);
     if (d->code_size < 0 || d->code_size > 4096 || d->code_count < 0 || d->code_count > 10000000)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: code_size is %d, code_count %d; at most 4096 and 1e7", name,
                           d->code_size, d->code_count);
@@ -6215,7 +6220,9 @@ DIST_API dist_net *dist_net_create(dist_context *ctx, const dist_net_desc *desc)
     memcpy(net->channel_names[1], "g", 2);
     memcpy(net->channel_names[2], "b", 2);
     net->raw = 1;
-    net->point_size = 3;
+    net->levels = d.levels;
+    net->base = 3.14159265358979323846;
+    net->point_size = 3 + 6 * d.levels;
     net->code_size = d.code_size;
     net->code_count = d.code_size > 0 ? d.code_count : 0;
     net->activation = d.activation;
@@ -6227,7 +6234,7 @@ DIST_API dist_net *dist_net_create(dist_context *ctx, const dist_net_desc *desc)
     net->norm_epsilon = 1e-5f;
     for (int l = 0; l < net->layers; l++) {
         net->layer[l].out = l + 1 == net->layers ? net->channels : d.width;
-        net->layer[l].in = (l > 0 ? d.width : 0) + (l == 0 || skip[l] ? 3 + d.code_size : 0);
+        net->layer[l].in = (l > 0 ? d.width : 0) + (l == 0 || skip[l] ? net->point_size + d.code_size : 0);
     }
     if (disti_net_arrange(ctx, net, "dist_net_create", skip, 1.0f) != DIST_OK) {
         dist_net_destroy(net);
@@ -8440,7 +8447,7 @@ typedef struct disti_render_backward_job {
     dist_context *ctx;
     disti_view view;
     double rotation[3], translation[3], focal[2], principal[2];
-    double *d_code, *d_color_code;
+    double *total, *d_code; /* of both codes, and of the first where it is wanted */
     unsigned long long capped, points, skipped;
     size_t count;
     size_t colored; /* of this run's colored hits, how many the pixels so far have taken */
@@ -8684,7 +8691,6 @@ static void disti_backward_colors(disti_render_backward_job *job, size_t first, 
 {
     const dist_tape *tape = job->tape;
     const dist_field *field = &tape->field;
-    float *weights = disti_color_weights(field, job->grads);
     size_t n = 0;
     for (size_t pixel = first; pixel < first + count; pixel++) {
         disti_ray ray;
@@ -8696,8 +8702,7 @@ static void disti_backward_colors(disti_render_backward_job *job, size_t first, 
     }
     memset(tape->pull, 0, 3 * n * sizeof(float));
     disti_color_backward_all(job->ctx, field, n, tape->hit, tape->d_color, job->geometry ? tape->pull : NULL,
-                             job->grads->code ? job->d_code : NULL, job->d_color_code);
-    if (weights) field->color_weights_fn(field->user, job->ctx, n, tape->hit, tape->d_color, weights);
+                             job->grads, job->total);
     job->points += n;
     job->colored = 0;
 }
@@ -8763,15 +8768,14 @@ DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *ta
     job.camera = disti_gradients_camera(grads);
     disti_view_of(&tape->camera, &job.view);
     job.geometry = grads->code || grads->weights || job.camera;
-    double *total = ctx->partial + (size_t)DISTI_SLOTS * size;
-    memset(total, 0, size * sizeof(double));
-    if (grads->code) job.d_code = total;
-    if (grads->color_code) job.d_color_code = total + code;
+    job.total = ctx->partial + (size_t)DISTI_SLOTS * size;
+    memset(job.total, 0, size * sizeof(double));
+    if (grads->code) job.d_code = job.total;
     unsigned state = disti_float_state_enter(); /* the normals' share is evaluated outside disti_run */
     if (job.geometry || grads->color_code || grads->color_weights) disti_backward_pixels(&job);
     disti_float_state_leave(state);
-    for (size_t j = 0; grads->code && j < code; j++) grads->code[j] += (float)total[j];
-    for (size_t j = code; grads->color_code && j < size; j++) grads->color_code[j - code] += (float)total[j];
+    for (size_t j = 0; grads->code && j < code; j++) grads->code[j] += (float)job.total[j];
+    for (size_t j = code; grads->color_code && j < size; j++) grads->color_code[j - code] += (float)job.total[j];
     for (int i = 0; i < 3; i++) {
         if (grads->rotation) grads->rotation[i] += (float)job.rotation[i];
         if (grads->translation) grads->translation[i] += (float)job.translation[i];

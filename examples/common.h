@@ -5,7 +5,8 @@
 
    Contents: failing and clock, options, progress, random numbers, files and JSON, model, code and camera, pictures,
    curves.
-   COMMON_NO_MODEL, defined before the include, leaves out the embedded model (for the program that makes it). */
+   COMMON_NO_MODEL, defined before the include, leaves out the embedded model (for the program that makes it);
+   COMMON_TEXTURE adds the texture that colors it. */
 #ifndef DIST_EXAMPLES_COMMON_H
 #define DIST_EXAMPLES_COMMON_H
 
@@ -38,6 +39,10 @@
 #if !defined(COMMON_NO_MODEL) && __has_include("model.h")
 #define COMMON_MODEL
 #include "model.h"
+#endif
+#if defined(COMMON_TEXTURE) && __has_include("model_color.h")
+#define COMMON_MODEL_COLOR
+#include "model_color.h"
 #endif
 #endif
 
@@ -594,22 +599,46 @@ static inline void json_stats(json *j, const char *key, const dist_stats *s)
 
 /* ---- model, code, camera ----------------------------------------------------------------------------------------- */
 
-/* The model in examples/model.h: a safetensors file as little-endian words. */
-static inline dist_net *load_embedded(dist_context *ctx)
+/* A safetensors file from its little-endian words. */
+static inline dist_net *load_words(dist_context *ctx, size_t size, const unsigned *words)
 {
-#ifdef COMMON_MODEL
-    size_t size = (size_t)model_bytes;
     unsigned char *bytes = (unsigned char *)take(size, 1);
     for (size_t i = 0; i < size; i++) {
-        bytes[i] = (unsigned char)(model_words[i / 4] >> (8 * (i % 4)) & 255u);
+        bytes[i] = (unsigned char)(words[i / 4] >> (8 * (i % 4)) & 255u);
     }
     dist_net *net = dist_net_load(ctx, bytes, size);
     free(bytes);
     return net;
+}
+
+/* The model in examples/model.h. */
+static inline dist_net *load_embedded(dist_context *ctx)
+{
+#ifdef COMMON_MODEL
+    return load_words(ctx, (size_t)model_bytes, model_words);
 #else
     (void)ctx;
     fail("this program was compiled without examples/model.h, so it has no embedded model");
 #endif
+}
+
+/* The texture for it in examples/model_color.h, or one from a file: rgb = g(shape code, color code, point). Row i of its
+   codes is the code of shape 4 i, then coloring i, which goes with every shape. */
+static inline dist_net *load_texture(dist_context *ctx, const char *texture)
+{
+    dist_net *net = NULL;
+    if (strcmp(texture, "embedded") != 0) {
+        net = dist_net_load_file(ctx, texture);
+    } else {
+#ifdef COMMON_MODEL_COLOR
+        net = load_words(ctx, (size_t)texture_bytes, texture_words);
+#else
+        fail("this program was compiled without examples/model_color.h, so it has no embedded texture");
+#endif
+    }
+    check(ctx);
+    if (!net) { fail("%s cannot be loaded", texture); }
+    return net;
 }
 
 /* A file, or "embedded". Never NULL. */
@@ -1030,6 +1059,21 @@ static inline int picture_zoom(int width, int height)
 {
     int largest = width > height ? width : height;
     return largest >= 200 ? 1 : (256 + largest / 2) / largest;
+}
+
+/* A picture with each square of `scale` pixels averaged to one: the end of anti-aliasing. */
+static inline void canvas_reduce(canvas *c, int scale)
+{
+    canvas smaller = canvas_create(c->width / scale, c->height / scale, 0.0f);
+    size_t width = (size_t)smaller.width, side = (size_t)scale;
+    for (size_t i = 0; i < 3 * width * (size_t)smaller.height; i++) {
+        size_t sum = side * side / 2, x = i / 3 % width * side, y = i / 3 / width * side;
+        for (size_t k = 0; k < side * side; k++)
+            sum += c->rgb[3 * ((y + k / side) * (size_t)c->width + x + k % side) + i % 3];
+        smaller.rgb[i] = (unsigned char)(sum / (side * side));
+    }
+    canvas_destroy(c);
+    *c = smaller;
 }
 
 /* The same view in a picture `zoom` times as large. */

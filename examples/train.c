@@ -23,12 +23,12 @@ static const char usage[] =
     "  --layers N         hidden layers (default 5; a texture: 3)\n"
     "  --width N          units of each (default 128; a texture: 64)\n"
     "  --code N           numbers of a code (default 32; a texture: 8 beside the shape's)\n"
-    "  --steps N          steps of Adam (default 20000; a texture: 6000)\n"
+    "  --steps N          steps of Adam (default 20000, a texture too)\n"
     "  --epochs N         the same in passes over all shapes\n"
     "  --minutes M        the same by the clock: not reproducible\n"
-    "  --group N          shapes a step (default 64)\n"
+    "  --group N          shapes a step (default 64; a texture: 16)\n"
     "  --batch N          points of each of them (default 256)\n"
-    "  --pool N           points kept for each shape (default 24000)\n"
+    "  --pool N           points kept for each shape (default 24000; a texture: 2000)\n"
     "  --rate R           Adam's rate at the start, falling to nothing along a cosine (default 0.003)\n"
     "  --code-rate R      the same for the codes, which have their turn more rarely (default 0.015)\n"
     "  --prior W          weight of |code|^2 (default 0.0001)\n"
@@ -449,7 +449,7 @@ static void painter_begin(painter *t, dist_context *ctx, const settings *how, co
     desc.width = how->width;
     desc.code_size = (int)t->size;
     desc.code_count = SHAPE_COLORINGS;
-    desc.activation = DIST_ACTIVATION_SINE;
+    desc.levels = 3;
     desc.color = 1;
     desc.seed = how->seed;
     t->net = dist_net_create(ctx, &desc);
@@ -766,9 +766,8 @@ static settings parse(int argc, char **argv)
     memset(&how, 0, sizeof how);
     for (int i = 0; i < SHAPE_FAMILIES; i++) how.families[how.family_count++] = i;
     how.shapes = 64;
-    how.group = 64;
+    how.steps = 20000;
     how.batch = 256;
-    how.pool = 24000;
     how.rate = 3e-3f;
     how.code_rate = 1.5e-2f;
     how.prior = 1e-4f;
@@ -797,7 +796,8 @@ static settings parse(int argc, char **argv)
     if (!how.layers) how.layers = how.color ? 3 : 5;
     if (!how.width) how.width = how.color ? 64 : 128;
     if (!how.code) how.code = how.color ? 8 : 32;
-    if (!how.steps) how.steps = how.color ? 6000 : 20000;
+    if (!how.group) how.group = how.color ? 16 : 64;
+    if (!how.pool) how.pool = how.color ? 2000 : 24000;
     if (!how.evaluate && !how.out) fail("--out FILE.safetensors is missing; --help lists the options");
     if (how.evaluate && how.out) fail("--evaluate measures a model, --out trains one: choose one of them");
     return how;

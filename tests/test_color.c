@@ -487,8 +487,7 @@ TEST(a_texture_net_is_created_saved_and_trained)
     desc.width = 16;
     desc.code_size = 3;
     desc.color = 1;
-    desc.activation = DIST_ACTIVATION_SINE;
-    desc.scale = 4.0f;
+    desc.levels = 2;
     dist_net *net = dist_net_create(ctx, &desc);
     REQUIRE(net != NULL && dist_net_channels(net) == 3);
     size_t count = dist_net_weight_count(net);

@@ -458,6 +458,11 @@ typedef struct dist_render_desc {
     float lipschitz;     /* 0: the field's */
     int no_cones;        /* 1: every ray marches from the bounding sphere by itself */
     int no_prediction;   /* 1: no ray starts from what its neighbors found */
+    /* dist_trace only. any_hit 1: a ray ends as soon as anything is certain to block it, for shadows; its distance is
+       then that of a sample inside what blocks, its error how far before that it goes in. max_distance: how far a ray
+       looks, in lengths of its direction (1: from origin to origin + direction); 0: without end */
+    int any_hit;
+    float max_distance;
     /* (height, width): only pixels that are not 0 are traced. Read during dist_render; NULL: all. dist_trace: NULL */
     const unsigned char *pixels;
     unsigned long long max_queries; /* queries of one call at most; 0: no limit. Shared out over the tiles by their
@@ -496,10 +501,31 @@ typedef struct dist_hit {
 } dist_hit;
 
 /* Traces n rays (origins (n, 3), directions (n, 3) of any nonzero length) with the guarded tracer: picking, shadows,
-   collision. The first surface in front of each origin. */
+   visibility. The first surface in front of each origin; with how.any_hit any of them. */
 DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size_t n, const float *origins,
                                 const float *directions, const dist_render_desc *how, dist_hit *hits,
                                 dist_stats *stats);
+
+/* The nearest point of the surface to each of n points, found from where |f| falls: steps along the gradient onto the
+   surface, then along the surface as long as that brings it nearer. Exact for a distance; else a local nearest point.
+   closest (n, 3); distance (n) signed, below 0 inside, and status (n) may be NULL: DIST_RAY_HIT, DIST_RAY_UNRESOLVED
+   (no surface found: the last point tried), DIST_RAY_NOT_FINITE. Nothing is asked outside the bounding sphere. */
+DIST_API dist_status dist_field_closest_point(dist_context *ctx, const dist_field *field, size_t n,
+                                              const float *points, float *closest, float *distance,
+                                              unsigned char *status);
+
+/* A sphere against a field. */
+typedef struct dist_contact {
+    float depth;     /* how far the sphere is in; below 0: they are at least so far apart */
+    float normal[3]; /* unit, out of the field: moving the sphere by depth * normal ends the contact; 0 without one */
+    float point[3];  /* of the surface, the deepest in the sphere */
+    int status;      /* DIST_RAY_HIT: they touch; DIST_RAY_MISS; else as dist_field_closest_point */
+} dist_contact;
+
+/* n spheres (n, 4), center and radius, against the field. A sphere that is clear of it costs one query, or none where
+   it is clear of the bounding sphere. */
+DIST_API dist_status dist_field_collide(dist_context *ctx, const dist_field *field, size_t n, const float *spheres,
+                                        dist_contact *contacts);
 
 /* ---- 08 render --------------------------------------------------------------------------------------------------- */
 
@@ -3180,8 +3206,8 @@ static dist_status disti_scene_place(dist_scene *scene, int k, const dist_instan
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.code_size is %d, must stay what it was: %d", function,
                           (double)disti_field_code(&next.field), (double)placed->code);
     if (!create && !next.field.color_fn != !placed->field.color_fn)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: an instance %s color cannot come in place of one %s", function, 0,
-                          0);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: a field with color and one without cannot replace each other",
+                          function, 0, 0);
     if (disti_scene_within(scene, &next.field))
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: the field is this scene's own", function, 0, 0);
     if (!disti_finite(s->scale) || s->scale < 0.0f)
@@ -3248,7 +3274,7 @@ DIST_API dist_scene *dist_scene_create(dist_context *ctx, int count, const dist_
     size_t lanes;
     if (disti_enter(ctx, name) != DIST_OK) return NULL;
     if (count < 1 || count > 1 << 20 || !instances) {
-        disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: count is %d, must be 1 to 2^20, and instances not NULL", name, count, 0);
+        disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: count is %d, must be 1 to 2^20; instances not NULL", name, count, 0);
         return NULL;
     }
     dist_scene *scene = (dist_scene *)disti_alloc(ctx, sizeof(dist_scene));
@@ -6560,6 +6586,10 @@ static dist_status disti_how_check(dist_context *ctx, const dist_render_desc *ho
     if ((status = disti_choice(ctx, function, "inside", how->inside, DIST_INSIDE_EXIT)) != DIST_OK) return status;
     if ((status = disti_choice(ctx, function, "no_cones", how->no_cones, 1)) != DIST_OK) return status;
     if ((status = disti_choice(ctx, function, "no_prediction", how->no_prediction, 1)) != DIST_OK) return status;
+    if ((status = disti_choice(ctx, function, "any_hit", how->any_hit, 1)) != DIST_OK) return status;
+    if (!disti_finite(how->max_distance) || how->max_distance < 0.0f)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.max_distance is %d, must be 0 or positive", function,
+                          (double)how->max_distance, 0);
     if (!disti_finite(how->step_scale) || how->step_scale < 0.0f || how->step_scale > 100.0f)
         return disti_fail(ctx, DIST_BAD_ARGUMENT,
                           "%s: how.step_scale is %d, must be above 0 (0: the default) and at most 100", function,
@@ -6897,6 +6927,8 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
         ray->fbest = sample;
     }
     ray->steps++;
+    if (tracer->how.any_hit && f < 0.0f && ray->mode != DISTI_FIRST)
+        return disti_ray_end(ray, DIST_RAY_HIT, q, f, q - ray->s);
     if (ray->mode == DISTI_BRACKET) {
         if (ray->steps < tracer->how.max_steps + 40) return disti_ray_bracketed(tracer, ray, f);
         return disti_ray_end(ray, DIST_RAY_HIT, 0.5f * (ray->a + ray->b), 0.0f, ray->b - ray->a);
@@ -7242,10 +7274,16 @@ static void disti_free_task(void *arg, int index, int worker)
             o[k] = (double)job->origins[3 * (first + i) + k];
             d[k] = (double)job->directions[3 * (first + i) + k];
         }
+        double end = (double)job->tracer->how.max_distance * sqrt(disti_dot(d, d));
         int good = disti_finite_all(3, job->origins + 3 * (first + i)) &&
                    disti_finite_all(3, job->directions + 3 * (first + i)) && disti_normalize(d);
         if (!good) o[0] = o[1] = o[2] = d[0] = d[1] = d[2] = 0.0;
-        disti_ray_init(job->tracer->field, o, d, 0.0, &bench.rays[i]);
+        disti_ray *ray = &bench.rays[i];
+        disti_ray_init(job->tracer->field, o, d, 0.0, ray);
+        if (end > 0.0 && end - ray->base < (double)ray->leave) {
+            ray->leave = DISTI_MAX(ray->enter, (float)(end - ray->base));
+            if (ray->leave <= ray->enter) ray->mode = DISTI_DONE;
+        }
         if (!good) disti_ray_end(&bench.rays[i], DIST_RAY_NOT_FINITE, 0.0f, 0.0f, 0.0f);
     }
     disti_budget budget;
@@ -7290,6 +7328,188 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
     disti_run(ctx, (int)((n + DISTI_FREE_RAYS - 1) / DISTI_FREE_RAYS), disti_free_task, &job);
     disti_stats_end(ctx, &tracer, stats);
     return DIST_OK;
+}
+
+/* Nearest points and contacts. From x on the surface a share of the way back to p and down to the surface again,
+   x' = P(x + share (p - x)): stays where x is nearest, in creases too, and cannot overshoot where the surface bends away;
+   P, steps of Newton along the gradient, is where it is a distance's own foot. Half the share where that came no
+   nearer. */
+typedef struct disti_foot {
+    float p[3], x[3];
+    float best[3], normal[3]; /* nearest surface point so far, grad f there at unit length */
+    float distance;  /* from p to it, 3e38: none yet; of a miss: the least there can be */
+    float least;     /* no surface is nearer to p than this */
+    float radius;    /* p is a sphere's center; 3e38: none */
+    float away;      /* of p from the bounding sphere; 0: within */
+    float f, damping, share;
+    float sign;
+    unsigned char status, steps;
+} disti_foot;
+
+enum { DISTI_FEET = 512, DISTI_FOOT_STEPS = 96 };
+
+/* Moves x by `step` times n and keeps it in the bounding sphere. Returns how far out it would have been. */
+static float disti_foot_move(const dist_field *field, float *x, const float *n, float step)
+{
+    const float *c = field->center;
+    for (int i = 0; i < 3; i++) x[i] += step * n[i];
+    float length = disti_length(x[0] - c[0], x[1] - c[1], x[2] - c[2]);
+    for (int i = 0; i < 3 && length > field->radius; i++) x[i] = c[i] + (x[i] - c[i]) / length * field->radius;
+    return DISTI_MAX(length - field->radius, 0.0f);
+}
+
+/* x is on the surface, n its normal. */
+static int disti_foot_arrive(const dist_field *field, disti_foot *foot, const float *n)
+{
+    float d[3], r = field->radius, reach = field->clamp > 0.0f ? 0.5f * field->clamp : 2.0f * r;
+    for (int i = 0; i < 3; i++) d[i] = foot->p[i] - foot->x[i];
+    float distance = disti_length(d[0], d[1], d[2]), gain = foot->distance - distance;
+    foot->status = DIST_RAY_HIT;
+    if (gain > 0.0f) {
+        memcpy(foot->best, foot->x, sizeof foot->best);
+        memcpy(foot->normal, n, sizeof foot->normal);
+        foot->distance = distance;
+    }
+    if (gain < 1e-5f * r) foot->share *= 0.5f;
+    if (foot->share < 0.02f || foot->distance <= foot->least * 1.00002f + 2e-6f * r) return 0;
+    float share = DISTI_MIN(foot->share, reach / foot->distance);
+    for (int i = 0; i < 3; i++) d[i] = foot->p[i] - foot->best[i];
+    memcpy(foot->x, foot->best, sizeof foot->x);
+    disti_foot_move(field, foot->x, d, share);
+    foot->damping = 1.0f;
+    foot->f = 0.0f;
+    return 1;
+}
+
+/* One sample f with gradient g at x. 1: another one is wanted at the new x. */
+static int disti_foot_advance(const dist_field *field, disti_foot *foot, float f, const float *g)
+{
+    float lipschitz = field->lipschitz > 0.0f ? field->lipschitz : 1.0f, size = f < 0.0f ? -f : f;
+    float slope = disti_length(g[0], g[1], g[2]), n[3];
+    if (!disti_finite(f) || !disti_finite(slope)) {
+        foot->status = DIST_RAY_NOT_FINITE;
+        return 0;
+    }
+    for (int i = 0; i < 3; i++) n[i] = slope > 1e-6f ? g[i] / slope : foot->p[i] - field->center[i];
+    if (!(slope > 1e-6f)) { /* no direction: past the center, or any */
+        float length = disti_length(n[0], n[1], n[2]);
+        for (int i = 0; i < 3; i++) n[i] = length > 1e-6f * field->radius ? n[i] / length : i == 0 ? 1.0f : 0.0f;
+    }
+    if (foot->steps++ == 0) {
+        float least = f > 0.0f || foot->away <= 0.0f ? size / lipschitz : 0.0f;
+        least = sqrtf(foot->away * foot->away + least * least);
+        foot->sign = f < 0.0f && foot->away <= 0.0f ? -1.0f : 1.0f;
+        foot->least = least;
+        if (foot->sign > 0.0f && least >= foot->radius) {
+            foot->status = DIST_RAY_MISS;
+            foot->distance = least;
+            return 0;
+        }
+    }
+    if (size <= 2e-6f * field->radius * DISTI_MAX(slope, 0.25f)) return disti_foot_arrive(field, foot, n);
+    if (foot->steps >= DISTI_FOOT_STEPS) return 0;
+    if (f * foot->f < 0.0f && size > 0.5f * (foot->f < 0.0f ? -foot->f : foot->f)) foot->damping *= 0.5f;
+    foot->f = f;
+    disti_foot_move(field, foot->x, n, -foot->damping * f / DISTI_MAX(slope, 0.5f * lipschitz));
+    return 1;
+}
+
+typedef struct disti_foot_job {
+    dist_context *ctx;
+    const dist_field *field;
+    size_t n, stride; /* floats a point: 3, or 4 with a sphere's radius */
+    const float *points;
+    float *closest, *distance;
+    unsigned char *status;
+    dist_contact *contacts;
+} disti_foot_job;
+
+static void disti_foot_task(void *arg, int index, int worker)
+{
+    const disti_foot_job *job = (const disti_foot_job *)arg;
+    const dist_field *field = job->field;
+    const float zero[3] = {0.0f, 0.0f, 0.0f};
+    disti_bench bench;
+    disti_bench_init(job->ctx, worker, &bench);
+    disti_foot *feet = (disti_foot *)(void *)bench.rest;
+    float *gradient = (float *)(void *)(feet + DISTI_FEET);
+    size_t first = (size_t)index * DISTI_FEET, n = DISTI_MIN((size_t)DISTI_FEET, job->n - first), active = 0;
+    for (size_t i = 0; i < n; i++) {
+        disti_foot *foot = &feet[i];
+        const float *p = job->points + job->stride * (first + i);
+        memset(foot, 0, sizeof *foot);
+        memcpy(foot->p, p, sizeof foot->p);
+        memcpy(foot->x, p, sizeof foot->x);
+        foot->distance = 3e38f;
+        foot->radius = job->contacts ? p[3] : 3e38f;
+        foot->damping = foot->sign = 1.0f;
+        foot->share = 0.5f;
+        foot->status = DIST_RAY_NOT_FINITE;
+        if (!disti_finite_all(job->stride, p)) continue;
+        foot->away = disti_foot_move(field, foot->x, zero, 0.0f);
+        foot->status = foot->away >= foot->radius ? DIST_RAY_MISS : DIST_RAY_UNRESOLVED;
+        if (foot->status == DIST_RAY_MISS) foot->distance = foot->away;
+        else bench.index[active++] = (int)i;
+    }
+    while (active > 0) {
+        size_t kept = 0;
+        for (size_t i = 0; i < active; i++)
+            memcpy(bench.points + 3 * i, feet[bench.index[i]].x, 3 * sizeof(float));
+        field->eval_fn(field->user, worker, active, bench.points, bench.sdf, gradient);
+        for (size_t i = 0; i < active; i++)
+            if (disti_foot_advance(field, &feet[bench.index[i]], bench.sdf[i], gradient + 3 * i))
+                bench.index[kept++] = bench.index[i];
+        active = kept;
+    }
+    for (size_t i = 0; i < n; i++) {
+        disti_foot *foot = &feet[i];
+        float d[3] = {foot->p[0] - foot->x[0], foot->p[1] - foot->x[1], foot->p[2] - foot->x[2]};
+        if (foot->status != DIST_RAY_HIT) memcpy(foot->best, foot->x, sizeof foot->best);
+        if (foot->status == DIST_RAY_UNRESOLVED) foot->distance = disti_length(d[0], d[1], d[2]);
+        if (job->contacts) {
+            dist_contact *contact = &job->contacts[first + i];
+            contact->depth = foot->radius - foot->sign * foot->distance;
+            if (foot->status == DIST_RAY_HIT && !(contact->depth > 0.0f)) foot->status = DIST_RAY_MISS;
+            if (foot->status == DIST_RAY_NOT_FINITE) contact->depth = 0.0f;
+            memcpy(contact->normal, foot->status == DIST_RAY_HIT ? foot->normal : zero, sizeof contact->normal);
+            for (size_t k = 0; k < 3 && foot->status == DIST_RAY_HIT && foot->distance > 1e-3f * field->radius; k++)
+                contact->normal[k] = foot->sign * (foot->p[k] - foot->best[k]) / foot->distance; /* right at an edge */
+            memcpy(contact->point, foot->best, sizeof contact->point);
+            contact->status = foot->status;
+            continue;
+        }
+        memcpy(job->closest + 3 * (first + i), foot->best, sizeof foot->best);
+        if (job->distance) job->distance[first + i] = foot->sign * foot->distance;
+        if (job->status) job->status[first + i] = foot->status;
+    }
+}
+
+static dist_status disti_foot_run(disti_foot_job *job, const char *function, const void *out)
+{
+    dist_status status = disti_enter(job->ctx, function);
+    if (status == DIST_OK) status = disti_field_check(job->ctx, job->field, function);
+    if (status != DIST_OK) return status;
+    if (job->n > 0 && (!job->points || !out))
+        return disti_fail(job->ctx, DIST_BAD_ARGUMENT, "%s: what is asked or what is answered is NULL", function, 0, 0);
+    if (job->n > (size_t)1 << 39)
+        return disti_fail(job->ctx, DIST_BAD_ARGUMENT, "%s: n is %d, at most 2^39", function, (double)job->n, 0);
+    disti_run(job->ctx, (int)((job->n + DISTI_FEET - 1) / DISTI_FEET), disti_foot_task, job);
+    return DIST_OK;
+}
+
+DIST_API dist_status dist_field_closest_point(dist_context *ctx, const dist_field *field, size_t n,
+                                              const float *points, float *closest, float *distance,
+                                              unsigned char *status)
+{
+    disti_foot_job job = {ctx, field, n, 3, points, closest, distance, status, NULL};
+    return disti_foot_run(&job, "dist_field_closest_point", closest);
+}
+
+DIST_API dist_status dist_field_collide(dist_context *ctx, const dist_field *field, size_t n, const float *spheres,
+                                        dist_contact *contacts)
+{
+    disti_foot_job job = {ctx, field, n, 4, spheres, NULL, NULL, NULL, contacts};
+    return disti_foot_run(&job, "dist_field_collide", contacts);
 }
 
 /* Cones: a block of pixels marches as one while the sphere that f / L proves empty is wider than the block's cone
@@ -8380,6 +8600,8 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     if (status == DIST_OK) status = disti_tracer_init(&tracer, ctx, field, desc, name);
     if (status != DIST_OK) return status;
     if (!out) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: out is NULL", name, 0, 0);
+    if (tracer.how.any_hit || tracer.how.max_distance > 0.0f)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.any_hit and how.max_distance are for dist_trace", name, 0, 0);
     if (out->color && !field->color_fn)
         return disti_fail(ctx, DIST_UNSUPPORTED, "%s: out.color is wanted, but the field has no color", name, 0, 0);
     if (tape && tape->ctx != ctx)

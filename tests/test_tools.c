@@ -1,0 +1,501 @@
+/* SPDX-License-Identifier: MIT-0
+   test_tools.c - what tools and games ask of a field: is anything in the way, what is nearest, do these touch; against
+   fields worked out in double. */
+#include "shapes.h"
+
+#include "model.h"
+
+enum { RAYS = 3000 };
+
+static float origins[3 * RAYS], directions[3 * RAYS], points[4 * RAYS], closest[3 * RAYS], distance[RAYS];
+static dist_hit nearest[RAYS], any[RAYS];
+static unsigned char status[RAYS];
+static dist_contact contacts[RAYS];
+
+enum { SHAPES = 5 };
+
+static void make_shapes(test_shape shapes[SHAPES])
+{
+    shapes[0] = shape_make(SHAPE_SPHERE, 0.7, 0, 0, 0);
+    shapes[1] = shape_make(SHAPE_TORUS, 0.6, 0.2, 0, 0);
+    shapes[2] = shape_make(SHAPE_BOX, 0.4, 0.5, 0.3, 0);
+    shapes[3] = shape_make(SHAPE_RODS, 0.05, 0, 0, 0);
+    shapes[4] = shape_make(SHAPE_TORUS, 0.6, 0.2, 0, 0);
+    shapes[4].clamp = 0.1;
+}
+
+/* From around the shape through it, and some from near by in any direction. */
+static void make_rays(test_random *random, const test_shape *shape)
+{
+    for (int i = 0; i < RAYS;) {
+        float from[3], to[3], length = test_random_float(random, 0.3f, 3.0f);
+        double p[3];
+        test_random_direction(random, from);
+        test_random_direction(random, to);
+        for (int k = 0; k < 3; k++) {
+            from[k] *= i % 3 ? 2.5f : test_random_float(random, 0.3f, 1.2f);
+            to[k] = i % 3 ? 0.7f * to[k] - from[k] : to[k];
+            p[k] = (double)from[k];
+        }
+        if (shape_value(shape, p) < 0.02) continue; /* in the solid */
+        double size = shape_length((double)to[0], (double)to[1], (double)to[2]);
+        for (int k = 0; k < 3; k++) {
+            origins[3 * i + k] = from[k];
+            directions[3 * i + k] = length * to[k] / (float)size;
+        }
+        i++;
+    }
+}
+
+static int blocked(const dist_hit *hit)
+{
+    return hit->status == DIST_RAY_HIT;
+}
+
+TEST(any_hit_finds_a_blocker_where_there_is_one_for_fewer_queries)
+{
+    dist_context *ctx = shape_context();
+    test_shape shapes[SHAPES];
+    make_shapes(shapes);
+    for (int k = 0; k < SHAPES; k++) {
+        test_random random = test_random_seed(3 + (unsigned)k);
+        dist_field field = shape_field(&shapes[k], 1, 1);
+        dist_render_desc how;
+        dist_stats first, second;
+        int differ = 0, hits = 0, outside = 0, before = 0;
+        memset(&how, 0, sizeof how);
+        make_rays(&random, &shapes[k]);
+        CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, RAYS, origins, directions, &how, nearest, &first), ctx);
+        how.any_hit = 1;
+        CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, RAYS, origins, directions, &how, any, &second), ctx);
+        for (int i = 0; i < RAYS; i++) {
+            differ += blocked(&nearest[i]) != blocked(&any[i]);
+            if (!blocked(&any[i]) || !blocked(&nearest[i])) continue;
+            double p[3], length = 0;
+            for (int axis = 0; axis < 3; axis++)
+                length += (double)directions[3 * i + axis] * (double)directions[3 * i + axis];
+            for (int axis = 0; axis < 3; axis++)
+                p[axis] = (double)origins[3 * i + axis] +
+                          (double)any[i].distance * (double)directions[3 * i + axis] / sqrt(length);
+            hits++;
+            outside += shape_value(&shapes[k], p) > 1e-4;
+            before += any[i].distance < nearest[i].distance - nearest[i].error - 1e-4f;
+        }
+        CHECK(hits > RAYS / 10);
+        CHECK(differ <= RAYS / 1000); /* rays that graze */
+        CHECK_EQUAL(0, outside);
+        CHECK_EQUAL(0, before);
+        CHECK(second.queries < first.queries);
+        if (test_state.verbose)
+            printf("    %d hits, queries %llu, any hit %llu\n", hits, first.queries, second.queries);
+    }
+    dist_context_destroy(ctx);
+}
+
+TEST(a_ray_looks_as_far_as_it_is_told_in_lengths_of_its_direction)
+{
+    dist_context *ctx = shape_context();
+    test_shape shapes[SHAPES];
+    make_shapes(shapes);
+    for (int k = 0; k < SHAPES; k++) {
+        test_random random = test_random_seed(13 + (unsigned)k);
+        dist_field field = shape_field(&shapes[k], 1, 1);
+        dist_render_desc how;
+        dist_stats first, second;
+        memset(&how, 0, sizeof how);
+        make_rays(&random, &shapes[k]);
+        CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, RAYS, origins, directions, &how, nearest, &first), ctx);
+        for (int both = 0; both < 2; both++) {
+            int wrong = 0, cut = 0, hits = 0;
+            how.max_distance = 0.8f;
+            how.any_hit = both;
+            CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, RAYS, origins, directions, &how, any, &second), ctx);
+            for (int i = 0; i < RAYS; i++) {
+                float length = disti_length(directions[3 * i], directions[3 * i + 1], directions[3 * i + 2]);
+                float off = nearest[i].distance - 0.8f * length;
+                if (!blocked(&nearest[i])) {
+                    wrong += blocked(&any[i]);
+                } else if (off > 2e-3f) {
+                    wrong += blocked(&any[i]);
+                    cut++;
+                } else if (off < -2e-3f) {
+                    wrong += !blocked(&any[i]);
+                    hits++;
+                }
+            }
+            CHECK(cut > 50);
+            CHECK(hits > 50);
+            CHECK(wrong <= RAYS / 1000);
+            CHECK(second.queries < first.queries);
+        }
+    }
+    dist_context_destroy(ctx);
+}
+
+TEST(any_hit_and_max_distance_are_refused_where_they_mean_nothing)
+{
+    dist_context *ctx = shape_context();
+    float numbers[4] = {0, 0, 0, 0.5f}, depth[4];
+    dist_field field = dist_field_sphere(numbers);
+    dist_camera camera = shape_camera(2, 2);
+    dist_images out;
+    dist_render_desc how;
+    memset(&out, 0, sizeof out);
+    out.depth = depth;
+    for (int i = 0; i < 4; i++) {
+        memset(&how, 0, sizeof how);
+        how.any_hit = i == 0 ? 2 : i == 1;
+        how.max_distance = i == 2 ? 1.0f : i == 3 ? -1.0f : 0.0f;
+        CHECK_STATUS(DIST_BAD_ARGUMENT, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+        CHECK_STATUS(i == 1 || i == 2 ? DIST_OK : DIST_BAD_ARGUMENT,
+                     dist_trace(ctx, &field, 0, NULL, NULL, &how, NULL, NULL), ctx);
+    }
+    dist_context_destroy(ctx);
+}
+
+/* ---- nearest points ---------------------------------------------------------------------------------------------- */
+
+static void make_points(test_random *random, int stride, float size)
+{
+    for (int i = 0; i < RAYS; i++)
+        for (int k = 0; k < 3; k++) points[stride * i + k] = test_random_float(random, -size, size);
+}
+
+static void point_of(const float *p, double q[3])
+{
+    for (int k = 0; k < 3; k++) q[k] = (double)p[k];
+}
+
+TEST(closest_points_of_distances_are_exact)
+{
+    dist_context *ctx = shape_context();
+    test_shape shapes[SHAPES];
+    make_shapes(shapes);
+    for (int k = 0; k < 4; k++) {
+        test_random random = test_random_seed(23 + (unsigned)k);
+        dist_field field = shape_field(&shapes[k], 1, 1);
+        double worst = 0, residual = 0;
+        make_points(&random, 3, 1.6f);
+        CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &field, RAYS, points, closest, distance, status), ctx);
+        for (int i = 0; i < RAYS; i++) {
+            double p[3], q[3], f;
+            point_of(points + 3 * i, p);
+            point_of(closest + 3 * i, q);
+            f = shape_value(&shapes[k], p);
+            if (k == 3 && shape_length(p[0], p[1], p[2]) > 1) continue; /* no distance is asked: some rod that is near */
+            CHECK_EQUAL(DIST_RAY_HIT, status[i]);
+            residual = fmax(residual, fabs(shape_value(&shapes[k], q)));
+            worst = fmax(worst, fabs(fabs(f) - shape_length(p[0] - q[0], p[1] - q[1], p[2] - q[2])));
+            worst = fmax(worst, fabs(f - (double)distance[i]));
+        }
+        CHECK_NEAR(0, residual, 5e-6);
+        CHECK_NEAR(0, worst, 1e-4);
+        if (test_state.verbose)
+            printf("    residual %.2g, distance off %.2g, %.1f queries a point\n", residual, worst,
+                   (double)shapes[k].queries / RAYS);
+    }
+    dist_context_destroy(ctx);
+}
+
+/* Against the nearest of many surface points, found by tracing. */
+static double surface_sample(const dist_field *field, dist_context *ctx, float *surface, int *count)
+{
+    test_random random = test_random_seed(5);
+    *count = 0;
+    for (int i = 0; i < RAYS; i++) {
+        float u[3], to[3];
+        test_random_direction(&random, u);
+        test_random_direction(&random, to);
+        for (int k = 0; k < 3; k++) {
+            origins[3 * i + k] = field->center[k] + 2 * field->radius * u[k];
+            directions[3 * i + k] = field->center[k] + 0.8f * field->radius * to[k] - origins[3 * i + k];
+        }
+    }
+    dist_trace(ctx, field, RAYS, origins, directions, NULL, nearest, NULL);
+    for (int i = 0; i < RAYS; i++) {
+        float length = disti_length(directions[3 * i], directions[3 * i + 1], directions[3 * i + 2]);
+        if (!blocked(&nearest[i])) continue;
+        for (int k = 0; k < 3; k++)
+            surface[3 * *count + k] = origins[3 * i + k] + nearest[i].distance / length * directions[3 * i + k];
+        ++*count;
+    }
+    return 0;
+}
+
+static float surface[3 * RAYS];
+
+/* Share of the points for which a surface sample is nearer than what was found by more than `slack`. */
+static double beaten(int count, double slack)
+{
+    int n = 0;
+    for (int i = 0; i < RAYS; i++) {
+        double best = 1e30;
+        for (int j = 0; j < count; j++) {
+            double d = 0;
+            for (int k = 0; k < 3; k++) {
+                double x = (double)points[3 * i + k] - (double)surface[3 * j + k];
+                d += x * x;
+            }
+            best = fmin(best, d);
+        }
+        n += sqrt(best) < fabs((double)distance[i]) - slack;
+    }
+    return (double)n / RAYS;
+}
+
+TEST(closest_points_of_other_fields_are_on_the_surface_and_near)
+{
+    dist_context *ctx = shape_context();
+    for (int k = 0; k < 5; k++) {
+        test_random random = test_random_seed(33 + (unsigned)k);
+        test_shape shape = k == 0   ? shape_make(SHAPE_BUMPY, 0.7, 0.05, 8, 0)
+                           : k == 4 ? shape_make(SHAPE_BOX, 0.4, 0.5, 0.3, 0)
+                                    : shape_make(SHAPE_TORUS, 0.6, 0.2, 0, 0);
+        if (k == 1) shape.slope = 0.5;
+        if (k == 2) shape.clamp = 0.1;
+        if (k == 3) shape.slope = 2;
+        if (k == 4) shape.squash = 6;
+        dist_field field = shape_field(&shape, 1, k == 3 ? 2 : k == 4 ? 6 : 1.4);
+        int count, lost = 0;
+        double residual = 0;
+        make_points(&random, 3, 1.4f);
+        for (int i = 0; i < RAYS && k == 2; i++) { /* where the clamp leaves a distance to go by */
+            double p[3];
+            do {
+                for (int axis = 0; axis < 3; axis++) points[3 * i + axis] = test_random_float(&random, -1, 1);
+                point_of(points + 3 * i, p);
+            } while (fabs(shape_exact(&shape, p)) > 0.099);
+        }
+        long before = shape.queries;
+        CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &field, RAYS, points, closest, distance, status), ctx);
+        double queries = (double)(shape.queries - before) / RAYS;
+        for (int i = 0; i < RAYS; i++) {
+            double q[3], p[3];
+            point_of(closest + 3 * i, q);
+            point_of(points + 3 * i, p);
+            lost += status[i] != DIST_RAY_HIT;
+            if (status[i] != DIST_RAY_HIT) continue;
+            residual = fmax(residual, fabs(shape_value(&shape, q)));
+            CHECK(shape_value(&shape, p) * (double)distance[i] >= 0);
+            CHECK_NEAR(shape_length(p[0] - q[0], p[1] - q[1], p[2] - q[2]), fabs((double)distance[i]), 1e-5);
+        }
+        surface_sample(&field, ctx, surface, &count);
+        double share = beaten(count, 0.01);
+        CHECK(count > RAYS / 10);
+        CHECK(lost <= RAYS / 500);
+        CHECK_NEAR(0, residual, 2e-5);
+        CHECK(share < 0.05); /* two nearest points, and the wrong one found */
+        if (test_state.verbose)
+            printf("    %d lost, residual %.2g, %.2f %% beaten, %.1f queries a point\n", lost, residual, 100 * share,
+                   queries);
+    }
+    dist_context_destroy(ctx);
+}
+
+TEST(closest_points_of_networks_lie_on_their_surface)
+{
+    static const model_desc descs[2] = {
+        {.name = "relu", .code_size = 2, .width = 16, .clamp = 0.3},
+        {.name = "softplus", .code_size = 2, .activation = DIST_ACTIVATION_SOFTPLUS, .first_scale = 4.0}};
+    static float sdf[RAYS];
+    dist_context *ctx = test_context();
+    for (int k = 0; k < 3; k++) {
+        test_random random = test_random_seed(43 + (unsigned)k);
+        double code[MODEL_CODE] = {0.25, 0.25};
+        float codef[2] = {0.25f, 0.25f};
+        model m;
+        dist_net *net;
+        int n = test_quick() ? 200 : RAYS;
+        if (k == 2) {
+            const char *path = test_data_path("nets/fox.safetensors");
+            FILE *file = fopen(path, "rb");
+            if (!file) SKIP("there are no test data");
+            fclose(file);
+            net = dist_net_load_file(ctx, path);
+            n = 300;
+        } else {
+            m = model_make(&descs[k], 7);
+            model_fit_ball(&m, code, 0.6);
+            net = model_load(ctx, &m);
+        }
+        dist_shape *shape = dist_shape_create(ctx, net, k == 2 ? dist_net_code(net, 0) : codef);
+        dist_field field = dist_shape_field(shape);
+        double residual = 0;
+        int lost = 0;
+        make_points(&random, 3, 1.3f);
+        CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &field, (size_t)n, points, closest, distance, status), ctx);
+        CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &field, (size_t)n, closest, sdf, NULL), ctx);
+        for (int i = 0; i < n; i++) {
+            lost += status[i] != DIST_RAY_HIT;
+            if (status[i] == DIST_RAY_HIT) residual = fmax(residual, fabs((double)sdf[i]));
+        }
+        CHECK_NEAR(0, residual, 2e-5);
+        CHECK(lost <= n / 30); /* where f has a least value above 0 */
+        if (test_state.verbose) printf("    %d of %d lost, residual %.2g\n", lost, n, residual);
+        dist_shape_destroy(shape);
+        dist_net_destroy(net);
+        if (k < 2) model_free(&m);
+    }
+    dist_context_destroy(ctx);
+}
+
+/* ---- contacts ---------------------------------------------------------------------------------------------------- */
+
+TEST(contacts_have_the_depth_and_the_normal_of_the_shape)
+{
+    dist_context *ctx = shape_context();
+    test_shape shapes[SHAPES];
+    make_shapes(shapes);
+    for (int k = 0; k < 4; k++) {
+        test_random random = test_random_seed(53 + (unsigned)k);
+        dist_field field = shape_field(&shapes[k], 1, 1);
+        int touching = 0, wrong = 0, still = 0;
+        double worst = 0;
+        make_points(&random, 4, 1.5f);
+        for (int i = 0; i < RAYS; i++) points[4 * i + 3] = test_random_float(&random, 0.05f, 0.4f);
+        shapes[k].queries = 0;
+        CHECK_STATUS(DIST_OK, dist_field_collide(ctx, &field, RAYS, points, contacts), ctx);
+        for (int i = 0; i < RAYS; i++) {
+            const dist_contact *c = &contacts[i];
+            double p[3], f, r = (double)points[4 * i + 3];
+            point_of(points + 4 * i, p);
+            f = shape_value(&shapes[k], p);
+            if (fabs(r - f) < 1e-4) continue;
+            wrong += (f < r) != (c->status == DIST_RAY_HIT);
+            if (c->status != DIST_RAY_HIT) {
+                wrong += (double)c->depth < r - f - 1e-5 || c->depth > 0; /* no farther apart than it says */
+                continue;
+            }
+            touching++;
+            worst = fmax(worst, fabs((double)c->depth - (r - f)));
+            double out[3];
+            for (int axis = 0; axis < 3; axis++) out[axis] = p[axis] + 1.0001 * (double)(c->depth * c->normal[axis]);
+            still += shape_value(&shapes[k], out) < r - 2e-3;
+        }
+        CHECK(touching > RAYS / 20);
+        CHECK_EQUAL(0, wrong);
+        CHECK_NEAR(0, worst, 1e-4);
+        CHECK(k == 3 || still == 0); /* out of one rod may be into another */
+        if (test_state.verbose)
+            printf("    %d touch, depth off %.2g, %d still do, %.2f queries a sphere\n", touching, worst, still,
+                   (double)shapes[k].queries / RAYS);
+    }
+    dist_context_destroy(ctx);
+}
+
+TEST(spheres_that_are_clear_cost_one_query_or_none)
+{
+    dist_context *ctx = shape_context();
+    test_shape shape = shape_make(SHAPE_SPHERE, 0.5, 0, 0, 0);
+    dist_field field = shape_field(&shape, 1, 1);
+    float spheres[12] = {0.8f, 0, 0, 0.1f, 1.05f, 0, 0, 0.1f, 5, 0, 0, 1};
+    CHECK_STATUS(DIST_OK, dist_field_collide(ctx, &field, 3, spheres, contacts), ctx);
+    CHECK_EQUAL(2, shape.queries);
+    for (int i = 0; i < 3; i++) CHECK_EQUAL(DIST_RAY_MISS, contacts[i].status);
+    CHECK_NEAR(-0.2, contacts[0].depth, 1e-6);
+    CHECK_NEAR(-3, contacts[2].depth, 1e-6);
+    dist_context_destroy(ctx);
+}
+
+TEST(spheres_touch_the_instance_that_is_there)
+{
+    dist_context *ctx = test_context();
+    float ball[4] = {0, 0, 0, 0.5f}, box[6] = {0, 0, 0, 0.5f, 0.5f, 0.5f};
+    dist_field fields[2] = {dist_field_sphere(ball), dist_field_box(box)};
+    dist_instance two[2];
+    memset(two, 0, sizeof two);
+    two[0].field = &fields[0];
+    two[1].field = &fields[1];
+    two[1].placement.translation[0] = 3;
+    two[1].placement.scale = 2;
+    dist_scene *scene = dist_scene_create(ctx, 2, two);
+    dist_field field = dist_scene_field(scene);
+    float spheres[12] = {0, 0.6f, 0, 0.2f, 3, 0, 1.1f, 0.3f, 1.2f, 0, 0, 0.1f};
+    CHECK_STATUS(DIST_OK, dist_field_collide(ctx, &field, 3, spheres, contacts), ctx);
+    CHECK_EQUAL(DIST_RAY_HIT, contacts[0].status);
+    CHECK_NEAR(0.1, contacts[0].depth, 1e-5);
+    CHECK_NEAR(1, contacts[0].normal[1], 1e-5);
+    CHECK_EQUAL(DIST_RAY_HIT, contacts[1].status);
+    CHECK_NEAR(0.2, contacts[1].depth, 1e-5);
+    CHECK_NEAR(1, contacts[1].normal[2], 1e-5);
+    CHECK_NEAR(1, contacts[1].point[2], 1e-5);
+    CHECK_EQUAL(DIST_RAY_MISS, contacts[2].status);
+    dist_scene_destroy(scene);
+    dist_context_destroy(ctx);
+}
+
+TEST(what_has_no_answer_says_so)
+{
+    dist_context *ctx = shape_context();
+    test_shape shapes[3] = {shape_make(SHAPE_CONSTANT, 0.1, 0, 0, 0), shape_make(SHAPE_SPHERE, 0.6, 0, 0, 0),
+                            shape_make(SHAPE_SPHERE, 0.6, 0, 0, 0)};
+    float p[12] = {0.1f, 0.2f, 0.3f, 0.1f, 0, 0, 0.5f, 0.1f, 0, 0, 0, 0.1f};
+    shapes[1].poison = 0.4;
+    dist_field field = shape_field(&shapes[0], 1, 1);
+    CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &field, 1, p, closest, distance, status), ctx);
+    CHECK_EQUAL(DIST_RAY_UNRESOLVED, status[0]);
+    CHECK(disti_finite_all(3, closest));
+    CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &field, 1, p, closest, NULL, NULL), ctx);
+    field = shape_field(&shapes[1], 1, 1);
+    CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &field, 1, p + 4, closest, distance, status), ctx);
+    CHECK_EQUAL(DIST_RAY_NOT_FINITE, status[0]);
+    CHECK_STATUS(DIST_OK, dist_field_collide(ctx, &field, 1, p + 4, contacts), ctx);
+    CHECK_EQUAL(DIST_RAY_NOT_FINITE, contacts[0].status);
+    field = shape_field(&shapes[2], 1, 1); /* from the very center every way is as good */
+    CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &field, 1, p + 8, closest, distance, status), ctx);
+    CHECK_EQUAL(DIST_RAY_HIT, status[0]);
+    CHECK_NEAR(-0.6, distance[0], 1e-5);
+    uint32_t nan = 0x7fc00000u, infinity = 0x7f800000u;
+    float bad[8] = {0, 0, 0, 0, 0, 0, 0, 1};
+    memcpy(bad + 1, &nan, sizeof nan);
+    memcpy(bad + 6, &infinity, sizeof infinity);
+    CHECK_STATUS(DIST_OK, dist_field_collide(ctx, &field, 2, bad, contacts), ctx);
+    CHECK_EQUAL(DIST_RAY_NOT_FINITE, contacts[0].status);
+    CHECK_EQUAL(DIST_RAY_NOT_FINITE, contacts[1].status);
+    CHECK_STATUS(DIST_OK, dist_field_collide(ctx, &field, 0, NULL, NULL), ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_collide(ctx, &field, 1, NULL, contacts), ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_collide(ctx, NULL, 1, p, contacts), ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_collide(NULL, &field, 1, p, contacts), ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_closest_point(ctx, &field, 1, p, NULL, NULL, NULL), ctx);
+    dist_context_destroy(ctx);
+}
+
+TEST(many_points_are_the_same_as_single_ones)
+{
+    enum { N = 1300 };
+    static float alone[3];
+    test_scheduler scheduler = {7, 0};
+    dist_context_desc desc = test_context_desc();
+    desc.workers = 7;
+    desc.scheduler = test_scheduler_hook(&scheduler);
+    dist_context *ctx = dist_context_create(&desc);
+    float torus[5] = {0, 0, 0, 0.6f, 0.2f};
+    dist_field field = dist_field_torus(torus);
+    test_random random = test_random_seed(63);
+    make_points(&random, 3, 1.5f);
+    CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &field, N, points, closest, distance, status), ctx);
+    for (int i = 0; i < N; i += 37) {
+        float d;
+        CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &field, 1, points + 3 * i, alone, &d, NULL), ctx);
+        CHECK_BYTES(sizeof alone, closest + 3 * i, alone);
+        CHECK_BYTES(sizeof d, distance + i, &d);
+    }
+    dist_context_destroy(ctx);
+}
+
+int main(int argc, char **argv)
+{
+    test_begin(argc, argv);
+    RUN(any_hit_finds_a_blocker_where_there_is_one_for_fewer_queries);
+    RUN(a_ray_looks_as_far_as_it_is_told_in_lengths_of_its_direction);
+    RUN(any_hit_and_max_distance_are_refused_where_they_mean_nothing);
+    RUN(closest_points_of_distances_are_exact);
+    RUN(closest_points_of_other_fields_are_on_the_surface_and_near);
+    RUN(closest_points_of_networks_lie_on_their_surface);
+    RUN(contacts_have_the_depth_and_the_normal_of_the_shape);
+    RUN(spheres_that_are_clear_cost_one_query_or_none);
+    RUN(spheres_touch_the_instance_that_is_there);
+    RUN(what_has_no_answer_says_so);
+    RUN(many_points_are_the_same_as_single_ones);
+    return test_report();
+}

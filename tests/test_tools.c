@@ -305,7 +305,7 @@ TEST(closest_points_of_networks_lie_on_their_surface)
         float codef[2] = {0.25f, 0.25f};
         model m;
         dist_net *net;
-        int n = test_quick() ? 200 : RAYS;
+        int n = RAYS;
         if (k == 2) {
             const char *path = test_data_path("nets/fox.safetensors");
             FILE *file = fopen(path, "rb");

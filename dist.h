@@ -262,8 +262,8 @@ DIST_API dist_status dist_color_backward(dist_context *ctx, const dist_field *fi
 
 /* What makes f a distance: *loss = weight * mean over the n points of (|grad f| - 1)^2, and its gradient is added to
    grads->code and ->weights. loss and grads may be NULL; what grads holds of camera and color must be. Points whose
-   gradient is not finite add nothing. Exact where the field has second_fn (a ReLU's kinks have no share, as in automatic
-   differentiation), else by differences of 1e-3 of the radius. */
+   gradient is not finite add nothing. Exact where the field has second_fn (a ReLU's kinks have no share, as in
+   automatic differentiation), else by differences over 1e-3 of the radius. */
 DIST_API dist_status dist_field_eikonal(dist_context *ctx, const dist_field *field, size_t n, const float *points,
                                         float weight, float *loss, const dist_gradients *grads);
 #endif
@@ -2622,16 +2622,19 @@ static float *disti_chunk_scratch(const dist_context *ctx)
 }
 
 /* Adjoint of s_i = u_i . grad f(p_i), u the directions: adds H u to d_points, ds/dcode and ds/dweights; each may be
-   NULL. At most DISTI_CHUNK points. delta 0: exact, by the field's callbacks. Else by differences over h = delta,
-       s = |u| (f(p + h u^) - f(p - h u^)) / (2 h),    u^ = u / |u|:    two points with the seeds +-|u| / (2 h). */
+   NULL. stencil
+      0      exact, by the field's callbacks: at most DISTI_CHUNK points
+      2, 6   by differences over h = delta, seeds on f at so many points around each: at most DISTI_CHUNK * 3 / stencil
+             s = |u| (f(p + h u^) - f(p - h u^)) / (2 h), u^ = u / |u|, or
+             s = sum_k u_k (f(p + h e_k) - f(p - h e_k)) / (2 h) */
 static dist_status disti_field_second(dist_context *ctx, const dist_field *field, size_t n, const float *points,
-                                      const float *directions, float delta, float *d_points, double *d_code,
-                                      float *d_weights)
+                                      const float *directions, size_t stencil, float delta, float *d_points,
+                                      double *d_code, float *d_weights)
 {
     dist_status status = DIST_OK;
-    if (!(delta > 0.0f) && d_weights)
+    if (stencil == 0 && d_weights)
         return field->second_weights_fn(field->user, ctx, n, points, directions, d_points, d_code, d_weights);
-    if (!(delta > 0.0f)) {
+    if (stencil == 0) {
         disti_backward_job job;
         memset(&job, 0, sizeof job);
         job.field = field;
@@ -2641,22 +2644,21 @@ static dist_status disti_field_second(dist_context *ctx, const dist_field *field
         disti_backward_run(ctx, &job, n, d_code);
         return status;
     }
-    float *moved = disti_chunk_scratch(ctx), *seeds = moved + 6 * n, *pulls = d_points ? seeds + 2 * n : NULL;
-    for (size_t i = 0; i < n; i++) {
-        const float *u = directions + 3 * i;
-        float length = disti_length(u[0], u[1], u[2]), step = length > 0.0f ? delta / length : 0.0f;
-        for (size_t k = 0; k < 3; k++) {
-            moved[6 * i + k] = points[3 * i + k] + step * u[k];
-            moved[6 * i + 3 + k] = points[3 * i + k] - step * u[k];
-        }
-        seeds[2 * i] = length / (2.0f * delta);
-        seeds[2 * i + 1] = -seeds[2 * i];
+    size_t count = n * stencil;
+    float *moved = disti_chunk_scratch(ctx), *seeds = moved + 3 * count, *pulls = d_points ? seeds + count : NULL;
+    for (size_t i = 0; i < count; i++) {
+        const float *u = directions + i / stencil * 3, *p = points + i / stencil * 3;
+        size_t axis = i % stencil / 2;
+        float length = disti_length(u[0], u[1], u[2]), h = i % 2 ? -delta : delta;
+        for (size_t k = 0; k < 3; k++)
+            moved[3 * i + k] = p[k] + (stencil == 6 ? k == axis ? h : 0.0f : length > 0.0f ? h / length * u[k] : 0.0f);
+        seeds[i] = (stencil == 6 ? u[axis] : length) / (2.0f * h);
     }
-    if (pulls) memset(pulls, 0, 6 * n * sizeof(float));
+    if (pulls) memset(pulls, 0, 3 * count * sizeof(float));
     if (d_weights)
-        status = field->weights_fn(field->user, ctx, 2 * n, moved, seeds, NULL, NULL, pulls, d_code, d_weights);
-    else disti_field_backward_all(ctx, field, 2 * n, moved, seeds, NULL, NULL, pulls, d_code);
-    for (size_t i = 0; pulls && i < 3 * n; i++) d_points[i] += pulls[i / 3 * 6 + i % 3] + pulls[i / 3 * 6 + 3 + i % 3];
+        status = field->weights_fn(field->user, ctx, count, moved, seeds, NULL, NULL, pulls, d_code, d_weights);
+    else disti_field_backward_all(ctx, field, count, moved, seeds, NULL, NULL, pulls, d_code);
+    for (size_t i = 0; pulls && i < 3 * count; i++) d_points[i / (3 * stencil) * 3 + i % 3] += pulls[i];
     return status;
 }
 
@@ -2763,7 +2765,7 @@ DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *fi
 }
 
 /* forward   L = w / n sum_i (|g_i| - 1)^2,  g = grad f
-   backward  dL/dg_i = u_i = 2 w / n (1 - 1 / |g_i|) g_i, and on from there as the adjoint of u_i . grad f(p_i), u held */
+   backward  dL/dg_i = u_i = 2 w / n (1 - 1 / |g_i|) g_i, and on from there the adjoint of u_i . grad f(p_i), u held */
 DIST_API dist_status dist_field_eikonal(dist_context *ctx, const dist_field *field, size_t n, const float *points,
                                         float weight, float *loss, const dist_gradients *grads)
 {
@@ -2796,8 +2798,8 @@ DIST_API dist_status dist_field_eikonal(dist_context *ctx, const dist_field *fie
             for (int k = 0; k < 3; k++) g[k] = factor == 0.0f ? 0.0f : factor * g[k];
         }
         if (grads)
-            status = disti_field_second(ctx, field, count, points + 3 * at, gradient,
-                                        exact ? 0.0f : 1e-3f * field->radius, NULL, d_code, grads->weights);
+            status = disti_field_second(ctx, field, count, points + 3 * at, gradient, exact ? 0 : 2,
+                                        1e-3f * field->radius, NULL, d_code, grads->weights);
     }
     if (status == DIST_OK && loss) *loss = (float)((double)weight * sum / (double)n);
     if (status == DIST_OK && grads) disti_code_end(field, grads, d_code);
@@ -8113,15 +8115,14 @@ static void disti_paper_trace(const disti_tracer *tracer, int worker, const dist
 
 /*@ 08 render ------------------------------------------------------------------------------------------------------- */
 
-enum { DISTI_RUN = DISTI_SLOTS * DISTI_BLOCK }; /* pixels whose colors go back at once */
+enum { DISTI_RUN = DISTI_SLOTS * DISTI_BLOCK }; /* pixels whose colors and normals go back at once */
 
 /* One point of the backward pass. */
 typedef struct disti_entry {
     float d_distance;   /* dL/d(distance along the ray), field units */
-    float d_sdf;        /* dL/df at this point from elsewhere: silhouette, normal's differences, the paper's samples */
+    float d_sdf;        /* dL/df at this point from elsewhere: silhouette, the paper's samples */
     float d_depth;      /* dL/d(depth), which the ray's tilt alone changes too */
     float direction[3]; /* of the ray, field space */
-    float pivot[3];     /* the point that turns with the camera: the hit, also for a normal's differences around it */
     float weight;       /* of the implicit rule: |n . v| in the normal mode, 1 else */
     unsigned char capped;
 } disti_entry;
@@ -8140,8 +8141,7 @@ struct dist_tape {
     disti_tracer tracer;
     disti_entry *entry;     /* DISTI_CHUNK */
     float *points, *d_sdf, *d_points; /* (DISTI_CHUNK, 3), 1, 3 */
-    float *hit, *d_color, *pull;      /* (DISTI_RUN, 3): colored hits, and dL/dcolor, dL/dpoint there */
-    double *d_code;
+    float *hit, *d_color, *pull, *bend; /* (DISTI_RUN, 3): hits, dL/dcolor, dL/dpoint by color and by normal */
 };
 
 enum { DISTI_TAPE_HIT = 16, DISTI_TAPE_SAMPLE = 32 }; /* counts as a hit; has a sample of smallest |f| */
@@ -8161,7 +8161,7 @@ static size_t disti_tape_bytes(const dist_tape *tape, int part)
                               &bytes);
         break;
     case 3: bytes = DISTI_CHUNK * sizeof(disti_entry); break;
-    case 4: bytes = (DISTI_CHUNK * 7 + DISTI_RUN * 9) * sizeof(float); break;
+    case 4: bytes = (DISTI_CHUNK * 7 + DISTI_RUN * 12) * sizeof(float); break;
     }
     return good ? bytes : (size_t)-1;
 }
@@ -8210,6 +8210,7 @@ DIST_API dist_tape *dist_tape_create(dist_context *ctx, const dist_camera *camer
     tape->hit = tape->d_points + 3 * (size_t)DISTI_CHUNK;
     tape->d_color = tape->hit + 3 * (size_t)DISTI_RUN;
     tape->pull = tape->d_color + 3 * (size_t)DISTI_RUN;
+    tape->bend = tape->pull + 3 * (size_t)DISTI_RUN;
     return tape;
 }
 
@@ -8651,12 +8652,10 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
               summed, not averaged: the paper's approximation, in the scale of its authors' code.      (paper, 3.4)
    silhouette S = f(p_min) - epsilon: the seed d_S at the sample of smallest |f|                    (envelope theorem)
               off the sphere S = |o| - radius with o the ray's point nearest to it: y = d_S o / |o|.
-   normal's   n = G / |G|: u = (d_n - n (n . d_n)) / |G| pulls on G. Of the field: u . dG, by differences of df:
-              analytic (df(p + h u^) - df(p - h u^)) |u| / (2 h), which is first-order exact where f is smooth and the
-              only derivative that a ReLU net has; difference mode sum_i u_i (df(p + h e_i) - df(p - h e_i)) / (2 h);
-              and, but in the paper's mode, of the hit's motion: y += H u, d_t += v . H u, from grad f at the same
-              points.
-
+   normal's   n = G / |G|: u = (d_n - n (n . d_n)) / |G| pulls on G, and s = u . G with u held has the rest: the field
+              receives ds of it, the hit y = H u and, but in the paper's mode, d_t += y . v. Exact where f is smooth
+              and the field says how; by differences along u where it has kinks, which is the only derivative that a
+              ReLU net's normal has; in the difference mode by those of the normal itself.
    color      c = g(p, z, color code) at the hit p = o + t v: y = (dg/dp)^T d_c, d_t += y . v; z, the color code and the
               color's weights receive dg's own part.
 
@@ -8672,7 +8671,7 @@ typedef struct disti_render_backward_job {
     double *total, *d_code; /* of both codes, and of the first where it is wanted */
     unsigned long long capped, points, skipped;
     size_t count;
-    size_t colored; /* of this run's colored hits, how many the pixels so far have taken */
+    size_t colored, bent; /* of this run's hits with d_color and d_normal, how many the pixels so far have taken */
     int camera, geometry; /* a gradient of the camera, one that depends on where the hit is at all, is wanted */
 } disti_render_backward_job;
 
@@ -8759,7 +8758,7 @@ static void disti_backward_flush(disti_render_backward_job *job)
         if (!job->camera) continue;
         double p[3], y[3];
         for (size_t k = 0; k < 3; k++) {
-            p[k] = (double)entry->pivot[k];
+            p[k] = (double)tape->points[3 * i + k];
             y[k] = (double)tape->d_points[3 * i + k];
         }
         disti_add_pull(job, p, y, (double)(entry->weight * entry->d_depth));
@@ -8769,7 +8768,7 @@ static void disti_backward_flush(disti_render_backward_job *job)
 }
 
 static void disti_backward_add(disti_render_backward_job *job, const disti_ray *ray, const float *point,
-                               const float *pivot, float d_distance, float d_depth, float d_sdf)
+                               float d_distance, float d_depth, float d_sdf)
 {
     const dist_tape *tape = job->tape;
     disti_entry *entry = &tape->entry[job->count];
@@ -8777,55 +8776,8 @@ static void disti_backward_add(disti_render_backward_job *job, const disti_ray *
     entry->d_depth = d_depth;
     entry->d_sdf = d_sdf;
     memcpy(entry->direction, ray->direction, sizeof entry->direction);
-    memcpy(entry->pivot, pivot, sizeof entry->pivot);
     memcpy(tape->points + 3 * job->count, point, 3 * sizeof(float));
     if (++job->count == DISTI_CHUNK) disti_backward_flush(job);
-}
-
-/* The normal's share of one pixel: its differences become entries; returns what its motion adds to d_distance. */
-static float disti_backward_normal(disti_render_backward_job *job, const disti_ray *ray, const float *p,
-                                   const float *d_normal)
-{
-    const disti_tracer *tracer = &job->tape->tracer;
-    const dist_field *field = &job->tape->field;
-    disti_bench bench;
-    float gradient[3], points[18], values[6], slopes[18], seeds[6], motion = 0.0f;
-    double g[3], n[3], d[3], u[3], turned[3], h = (double)tracer->how.normal_delta;
-    size_t count = tracer->how.normal_mode == DIST_NORMAL_ANALYTIC ? 2 : 6;
-    disti_bench_init(job->ctx, 0, &bench);
-    disti_normal_gradient(tracer, 0, &bench, 1, p, gradient);
-    for (int i = 0; i < 3; i++) {
-        g[i] = n[i] = (double)gradient[i];
-        d[i] = (double)d_normal[i];
-    }
-    if (!disti_normalize(n)) return 0.0f;
-    if (tracer->how.normal_space == DIST_SPACE_CAMERA) {
-        double seen[3], torque[3];
-        disti_rotate(job->view.rotation, n, seen);
-        disti_cross(seen, d, torque);
-        for (int i = 0; i < 3; i++) job->rotation[i] += torque[i];
-        disti_rotate_back(job->view.rotation, d, turned);
-        memcpy(d, turned, sizeof d);
-    }
-    double along = disti_dot(n, d), length = sqrt(disti_dot(g, g));
-    for (int i = 0; i < 3; i++) u[i] = (d[i] - n[i] * along) / length;
-    double pull = sqrt(disti_dot(u, u));
-    if (!(pull > 0.0)) return 0.0f;
-    for (size_t k = 0; k < count; k++) {
-        double side = k & 1 ? -1.0 : 1.0;
-        for (size_t i = 0; i < 3; i++) {
-            double shift = count == 2 ? u[i] / pull : k / 2 == i ? 1.0 : 0.0;
-            points[3 * k + i] = p[i] + (float)(side * h * shift);
-        }
-        seeds[k] = (float)(side * (count == 2 ? pull : u[k / 2]) / (2.0 * h));
-    }
-    if (tracer->how.gradient != DIST_GRADIENT_PAPER) {
-        field->eval_fn(field->user, 0, count, points, values, slopes);
-        for (size_t k = 0; k < count; k++)
-            for (size_t i = 0; i < 3; i++) motion += seeds[k] * slopes[3 * k + i] * ray->direction[i];
-    }
-    for (size_t k = 0; k < count; k++) disti_backward_add(job, ray, points + 3 * k, p, 0.0f, 0.0f, seeds[k]);
-    return disti_finite(motion) ? motion : 0.0f;
 }
 
 /* What dL/dpoint at the hit p = o + t v gives: the pull on the camera at this t; returns dL/dt. */
@@ -8843,9 +8795,9 @@ static float disti_backward_hit(disti_render_backward_job *job, const disti_ray 
     return (float)d_distance;
 }
 
-/* One pixel with an upstream gradient; d_point is dL/dpoint at its hit, or NULL. */
+/* One pixel with an upstream gradient; d_point and d_bend: dL/dpoint at its hit by its color and normal, or NULL. */
 static void disti_backward_pixel(disti_render_backward_job *job, size_t pixel, float d_depth, float d_distance,
-                                 float d_silhouette, const float *d_normal, const float *d_point)
+                                 float d_silhouette, const float *d_point, const float *d_bend)
 {
     const dist_tape *tape = job->tape;
     const dist_field *field = &tape->field;
@@ -8871,18 +8823,18 @@ static void disti_backward_pixel(disti_render_backward_job *job, size_t pixel, f
         disti_add_pull(job, nearest, pull, (double)d_depth);
         d_depth = 0.0f;
     }
-    if (d_normal && (status & DISTI_TAPE_HIT)) d_distance += disti_backward_normal(job, &ray, p, d_normal);
     if (d_point) d_distance += disti_backward_hit(job, &ray, p, d_point);
+    float motion = d_bend ? disti_backward_hit(job, &ray, p, d_bend) : 0.0f;
+    if (!paper) d_distance += motion;
     if (tape->sample) {
         const float *samples = tape->sample + pixel * (size_t)tape->samples * 4;
         for (int k = 0; k < (paper ? tape->samples : 1); k++) {
             float f = samples[4 * k], seed = k == 0 ? d_silhouette : 0.0f;
             int inside_clamp = (f < 0.0f ? -f : f) <= 0.1f * field->radius;
             if (paper && inside_clamp) seed += disti_paper_alpha(&tracer->how) * d_distance;
-            if (seed != 0.0f)
-                disti_backward_add(job, &ray, samples + 4 * k + 1, samples + 4 * k + 1, 0.0f, 0.0f, seed);
+            if (seed != 0.0f) disti_backward_add(job, &ray, samples + 4 * k + 1, 0.0f, 0.0f, seed);
         }
-        if (!paper && d_distance != 0.0f) disti_backward_add(job, &ray, p, p, d_distance, d_depth, 0.0f);
+        if (!paper && d_distance != 0.0f) disti_backward_add(job, &ray, p, d_distance, d_depth, 0.0f);
         return;
     }
     if (paper) { /* all K samples are the hit */
@@ -8890,7 +8842,7 @@ static void disti_backward_pixel(disti_render_backward_job *job, size_t pixel, f
         d_distance = 0.0f;
     }
     if (d_distance != 0.0f || d_silhouette != 0.0f)
-        disti_backward_add(job, &ray, p, p, d_distance, d_depth, d_silhouette);
+        disti_backward_add(job, &ray, p, d_distance, d_depth, d_silhouette);
 }
 
 /* Upstream gradients that are not finite count as 0. */
@@ -8899,12 +8851,89 @@ static float disti_upstream(const float *plane, size_t at)
     return plane && disti_finite(plane[at]) ? plane[at] : 0.0f;
 }
 
-/* dL/dcolor of a pixel; 0: it has none. */
-static int disti_upstream_color(const disti_render_backward_job *job, size_t pixel, float d_color[3])
+/* dL/dcolor or dL/dnormal of a pixel, from its plane; 0: it has none. */
+static int disti_upstream_three(const disti_render_backward_job *job, const float *plane, size_t pixel, float d[3])
 {
-    if (!job->d_out->color || !(job->tape->status[pixel] & DISTI_TAPE_HIT)) return 0;
-    for (size_t k = 0; k < 3; k++) d_color[k] = disti_upstream(job->d_out->color, 3 * pixel + k);
-    return d_color[0] != 0.0f || d_color[1] != 0.0f || d_color[2] != 0.0f;
+    if (!plane || !(job->tape->status[pixel] & DISTI_TAPE_HIT)) return 0;
+    for (size_t k = 0; k < 3; k++) d[k] = disti_upstream(plane, 3 * pixel + k);
+    return d[0] != 0.0f || d[1] != 0.0f || d[2] != 0.0f;
+}
+
+/* Those of `count` pixels, at most DISTI_RUN, that have an upstream gradient in the plane: their hits in tape->hit, the
+   gradients in d; returns how many. */
+static size_t disti_backward_hits(const disti_render_backward_job *job, const float *plane, size_t first, size_t count,
+                                  float *d)
+{
+    const dist_tape *tape = job->tape;
+    size_t n = 0;
+    for (size_t pixel = first; pixel < first + count; pixel++) {
+        disti_ray ray;
+        double local[3];
+        if (!disti_upstream_three(job, plane, pixel, d + 3 * n)) continue;
+        disti_pixel_ray(&job->view, &tape->field, (int)(pixel % (size_t)tape->width),
+                        (int)(pixel / (size_t)tape->width), local, &ray);
+        disti_ray_point(&ray, tape->s[pixel], tape->hit + 3 * n++);
+    }
+    return n;
+}
+
+typedef struct disti_normals_job {
+    const dist_tape *tape;
+    disti_pieces pieces;
+    float *gradient;
+} disti_normals_job;
+
+static void disti_normals_task(void *arg, int index, int worker)
+{
+    const disti_normals_job *job = (const disti_normals_job *)arg;
+    disti_bench bench;
+    size_t first = (size_t)index * job->pieces.size;
+    disti_bench_init(job->tape->ctx, worker, &bench);
+    disti_normal_gradient(&job->tape->tracer, worker, &bench, DISTI_MIN(job->pieces.size, job->pieces.n - first),
+                          job->tape->hit + 3 * first, job->gradient + 3 * first);
+}
+
+/* The normals of `count` pixels, at most DISTI_RUN, back to code and weights, to the camera that turns with them, and
+   H u to tape->bend for the hits of those that have an upstream gradient, one after another. */
+static void disti_backward_normals(disti_render_backward_job *job, size_t first, size_t count)
+{
+    const dist_tape *tape = job->tape;
+    const dist_field *field = &tape->field;
+    const dist_render_desc *how = &tape->tracer.how;
+    disti_normals_job gradients;
+    size_t n = disti_backward_hits(job, job->d_out->normal, first, count, tape->bend), stencil = 2;
+    job->bent = 0;
+    if (n == 0) return;
+    if (how->normal_mode == DIST_NORMAL_DIFFERENCE) stencil = 6;
+    else if (field->second_fn && !field->kinks && (!job->grads->weights || field->second_weights_fn)) stencil = 0;
+    gradients.tape = tape;
+    gradients.pieces = disti_cut(n, 4 * DISTI_BLOCK, 1u << 20);
+    gradients.gradient = tape->d_points; /* free until the entries are flushed */
+    disti_run(job->ctx, gradients.pieces.count, disti_normals_task, &gradients);
+    for (size_t i = 0; i < n; i++) {
+        float *gradient = tape->d_points + 3 * i;
+        double g[3], normal[3], d[3], seen[3], torque[3];
+        for (size_t k = 0; k < 3; k++) {
+            g[k] = normal[k] = (double)gradient[k];
+            d[k] = (double)tape->bend[3 * i + k];
+            gradient[k] = 0.0f;
+        }
+        if (!disti_normalize(normal)) continue;
+        if (how->normal_space == DIST_SPACE_CAMERA) {
+            disti_rotate(job->view.rotation, normal, seen);
+            disti_cross(seen, d, torque);
+            for (int k = 0; k < 3; k++) job->rotation[k] += torque[k];
+            disti_rotate_back(job->view.rotation, d, seen);
+            memcpy(d, seen, sizeof d);
+        }
+        double along = disti_dot(normal, d), length = sqrt(disti_dot(g, g));
+        for (int k = 0; k < 3; k++) gradient[k] = (float)((d[k] - normal[k] * along) / length);
+        if (!disti_finite_all(3, gradient)) gradient[0] = gradient[1] = gradient[2] = 0.0f;
+    }
+    memset(tape->bend, 0, 3 * n * sizeof(float));
+    disti_field_second(job->ctx, field, n, tape->hit, tape->d_points, stencil, how->normal_delta, tape->bend,
+                       job->d_code, job->grads->weights);
+    job->points += n * (stencil ? stencil : 1);
 }
 
 /* The colors of `count` pixels, at most DISTI_RUN, back to codes and weights, and to tape->pull for the hits of those
@@ -8913,15 +8942,7 @@ static void disti_backward_colors(disti_render_backward_job *job, size_t first, 
 {
     const dist_tape *tape = job->tape;
     const dist_field *field = &tape->field;
-    size_t n = 0;
-    for (size_t pixel = first; pixel < first + count; pixel++) {
-        disti_ray ray;
-        double local[3];
-        if (!disti_upstream_color(job, pixel, tape->d_color + 3 * n)) continue;
-        disti_pixel_ray(&job->view, field, (int)(pixel % (size_t)tape->width), (int)(pixel / (size_t)tape->width),
-                        local, &ray);
-        disti_ray_point(&ray, tape->s[pixel], tape->hit + 3 * n++);
-    }
+    size_t n = disti_backward_hits(job, job->d_out->color, first, count, tape->d_color);
     memset(tape->pull, 0, 3 * n * sizeof(float));
     disti_color_backward_all(job->ctx, field, n, tape->hit, tape->d_color, job->geometry ? tape->pull : NULL,
                              job->grads, job->total);
@@ -8940,20 +8961,20 @@ static void disti_backward_pixels(disti_render_backward_job *job)
         float d_distance = hit ? disti_upstream(d_out->distance, pixel) : 0.0f;
         int asked = tape->status[pixel] != DIST_RAY_SKIPPED;
         float d_silhouette = asked ? disti_upstream(d_out->silhouette, pixel) : 0.0f;
-        float d_normal[3] = {0.0f, 0.0f, 0.0f}, d_color[3];
+        float d[3];
         if (d_out->color && pixel % DISTI_RUN == 0)
             disti_backward_colors(job, pixel, DISTI_MIN(pixels - pixel, (size_t)DISTI_RUN));
-        int colored = disti_upstream_color(job, pixel, d_color);
-        for (size_t k = 0; hit && d_out->normal && k < 3; k++)
-            d_normal[k] = disti_upstream(d_out->normal, 3 * pixel + k);
-        int normal = d_normal[0] != 0.0f || d_normal[1] != 0.0f || d_normal[2] != 0.0f;
+        if (d_out->normal && job->geometry && pixel % DISTI_RUN == 0)
+            disti_backward_normals(job, pixel, DISTI_MIN(pixels - pixel, (size_t)DISTI_RUN));
+        int colored = disti_upstream_three(job, d_out->color, pixel, d);
+        int normal = disti_upstream_three(job, d_out->normal, pixel, d);
         if (d_depth == 0.0f && d_distance == 0.0f && d_silhouette == 0.0f && !normal && !colored) {
             job->skipped++;
             continue;
         }
         const float *d_point = colored ? tape->pull + 3 * job->colored++ : NULL;
-        if (job->geometry)
-            disti_backward_pixel(job, pixel, d_depth, d_distance, d_silhouette, normal ? d_normal : NULL, d_point);
+        const float *d_bend = normal ? tape->bend + 3 * job->bent++ : NULL;
+        if (job->geometry) disti_backward_pixel(job, pixel, d_depth, d_distance, d_silhouette, d_point, d_bend);
     }
     disti_backward_flush(job);
 }
@@ -8993,7 +9014,7 @@ DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *ta
     job.total = ctx->partial + (size_t)DISTI_SLOTS * size;
     memset(job.total, 0, size * sizeof(double));
     if (grads->code) job.d_code = job.total;
-    unsigned state = disti_float_state_enter(); /* the normals' share is evaluated outside disti_run */
+    unsigned state = disti_float_state_enter(); /* also for what is not in disti_run */
     if (job.geometry || grads->color_code || grads->color_weights) disti_backward_pixels(&job);
     disti_float_state_leave(state);
     for (size_t j = 0; grads->code && j < code; j++) grads->code[j] += (float)job.total[j];

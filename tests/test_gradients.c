@@ -897,7 +897,7 @@ static void image_check_analytic(int plane, const dist_render_desc *how, int las
 
 static int is_smooth(const model_desc *d)
 {
-    return d->activation != DIST_ACTIVATION_RELU && d->activation != DIST_ACTIVATION_ELU;
+    return d->activation != DIST_ACTIVATION_RELU && d->activation != DIST_ACTIVATION_ELU; /* as to second derivatives */
 }
 
 static void image_check_nets(int plane, const dist_render_desc *how, int only_smooth, double tolerance)
@@ -979,6 +979,20 @@ TEST(analytic_normal_backward_in_world_space_matches_differences)
     dist_render_desc how = normal_how(DIST_NORMAL_ANALYTIC, DIST_SPACE_WORLD);
     image_check_analytic(NORMAL, &how, TORUS, 2e-3);
     image_check_nets(NORMAL, &how, 1, 2e-3);
+}
+
+/* What is exact does not know how->normal_delta: a step that differences could not use changes no bit. */
+TEST(analytic_normal_backward_of_smooth_nets_is_exact)
+{
+    dist_render_desc how = normal_how(DIST_NORMAL_ANALYTIC, DIST_SPACE_CAMERA);
+    image_check_nets(NORMAL, &how, 1, 5e-4);
+    how.normal_delta = 0.3f;
+    image_check_nets(NORMAL, &how, 1, 5e-4);
+    scene s; /* ELU: f'' jumps, but grad f does not */
+    scene_model(&s, &ball_nets[2], 62, 1);
+    CHECK_EQUAL(DIST_ACTIVATION_ELU, ball_nets[2].activation);
+    image_check(&s, NORMAL, &how, 5e-4);
+    scene_close(&s);
 }
 
 TEST(difference_normal_backward_in_camera_space_matches_differences)
@@ -1967,6 +1981,7 @@ int main(int argc, char **argv)
     RUN(silhouette_backward_with_the_sphere_behind_the_camera_matches_differences);
     RUN(analytic_normal_backward_in_camera_space_matches_differences);
     RUN(analytic_normal_backward_in_world_space_matches_differences);
+    RUN(analytic_normal_backward_of_smooth_nets_is_exact);
     RUN(difference_normal_backward_in_camera_space_matches_differences);
     RUN(difference_normal_backward_in_world_space_matches_differences);
     RUN(normal_mode_is_implicit_mode_weighted_by_the_cosine);

@@ -295,7 +295,8 @@ DIST_API void dist_scene_destroy(dist_scene *scene);
 /* Moves an instance or replaces its field (NULL: it stays) by one whose code is as long and that has a color if the old
    one had. No allocator call. Take dist_scene_field again afterwards: the bounding sphere changes. */
 DIST_API dist_status dist_scene_set(dist_scene *scene, int index, const dist_instance *instance);
-/* The scene as a field. Borrows the scene. It has a color if every instance has, and no gradient for weights. Its code
+/* The scene as a field. Borrows the scene. It has a color if every instance has, with an adjoint if each has one; its
+   color code is theirs one after another. No gradient for weights. Its code
    are, for each instance, its field's code (nothing if that has no adjoint), then its placement as dist_similarity_move
    has it: log-scale, w of R' = exp([w]x) R, translation. dist_gradients.code gets the gradients for all of them. */
 DIST_API dist_field dist_scene_field(dist_scene *scene);
@@ -2828,6 +2829,7 @@ typedef struct disti_placed {
     dist_field field;
     float scale, rotation[9], translation[3];
     size_t code, offset; /* numbers of its field's code that have an adjoint; where they stand in the scene's */
+    size_t color_offset; /* where its color code stands in the scene's */
 } disti_placed;
 
 typedef struct disti_ball {
@@ -2840,10 +2842,10 @@ struct dist_scene {
     disti_placed *placed;
     disti_ball *ball;
     unsigned char *scratch; /* ctx->workers times scratch_bytes */
-    size_t scratch_bytes, code_size;
+    size_t scratch_bytes, code_size, color_code_size;
 };
 
-enum { DISTI_SCENE_CHUNK = 2048 };
+enum { DISTI_SCENE_CHUNK = 2048, DISTI_SCENE_PIECE = DISTI_BLOCK };
 
 /* A worker's share of a scene's memory, for a chunk of points. */
 typedef struct disti_scene_work {
@@ -3152,27 +3154,91 @@ static void disti_scene_eval(void *user, int worker, size_t n, const float *poin
     disti_scene_fused(user, worker, n, points, sdf, gradient, NULL, NULL, NULL);
 }
 
-/* The color of the instance whose surface is nearest. */
-static void disti_scene_color(void *user, int worker, size_t n, const float *points, float *color)
+/* What a color's gradient needs. */
+typedef struct disti_scene_pull {
+    const float *d_color;
+    float *d_points;
+    double *d_code, *d_color_code;
+} disti_scene_pull;
+
+/* Back from the colors of the points j..j+count-1 in order, all of one instance, as of a pull y = dL/dp on points that
+   stay where they are: dq = -q d log s - R^T (w x (p - t) + dt) / s. */
+static void disti_scene_unpaint(const disti_placed *placed, int worker, const disti_scene_work *w, size_t j,
+                                size_t count, const float *points, const disti_scene_pull *pull)
 {
-    const dist_scene *scene = (const dist_scene *)user;
+    const dist_field *field = &placed->field;
+    float d_color[3 * DISTI_SCENE_PIECE], y[3 * DISTI_SCENE_PIECE];
+    memset(y, 0, sizeof y);
+    for (size_t i = 0; i < count; i++) memcpy(d_color + 3 * i, pull->d_color + 3 * w->order[j + i], 3 * sizeof(float));
+    field->color_adjoint_fn(field->user, worker, count, w->local + 3 * j, d_color, y,
+                            pull->d_code && placed->code > 0 ? pull->d_code + placed->offset : NULL,
+                            pull->d_color_code && field->color_code_size > 0
+                                ? pull->d_color_code + placed->color_offset : NULL);
+    for (size_t i = 0; i < count; i++) {
+        size_t at = 3 * (size_t)w->order[j + i];
+        double g[3], r[3], torque[3], *d = pull->d_code ? pull->d_code + placed->offset + placed->code : NULL;
+        for (size_t k = 0; k < 3; k++) {
+            const float *row = placed->rotation + 3 * k;
+            g[k] = (double)(row[0] * y[3 * i] + row[1] * y[3 * i + 1] + row[2] * y[3 * i + 2]) / (double)placed->scale;
+            r[k] = (double)points[at + k] - (double)placed->translation[k];
+            if (pull->d_points) pull->d_points[at + k] += (float)g[k];
+        }
+        disti_cross(g, r, torque);
+        if (d) d[0] -= disti_dot(g, r);
+        for (int k = 0; d && k < 3; k++) {
+            d[1 + k] += torque[k];
+            d[4 + k] -= g[k];
+        }
+    }
+}
+
+/* The color of the instance whose surface is nearest; with `back` its adjoint. */
+static void disti_scene_paint(const dist_scene *scene, int worker, size_t n, const float *points, float *color,
+                              const disti_scene_pull *back)
+{
     disti_scene_work w;
     disti_scene_layout(scene, scene->scratch + scene->scratch_bytes * (size_t)worker, &w);
     for (size_t at = 0; at < n; at += DISTI_SCENE_CHUNK) {
         size_t count = DISTI_MIN(n - at, (size_t)DISTI_SCENE_CHUNK);
+        disti_scene_pull pull;
+        memset(&pull, 0, sizeof pull);
+        if (back) {
+            pull = *back;
+            pull.d_color += 3 * at;
+            if (pull.d_points) pull.d_points += 3 * at;
+        }
         disti_scene_settle(scene, worker, count, points + 3 * at, &w, 0);
         for (size_t i = 0; i < count; i++)
             if (w.choice[i] < 0) w.choice[i] = w.winner[i];
         disti_scene_sort(scene, count, points + 3 * at, &w);
         for (int k = 0; k < scene->count; k++) {
             const dist_field *field = &scene->placed[k].field;
-            size_t first = (size_t)w.start[k], asked = (size_t)w.start[k + 1] - first;
-            if (asked > 0)
-                field->color_fn(field->user, worker, asked, w.local + 3 * first, w.slope + 3 * first);
+            size_t first = (size_t)w.start[k], end = (size_t)w.start[k + 1];
+            if (!back && end > first)
+                field->color_fn(field->user, worker, end - first, w.local + 3 * first, w.slope + 3 * first);
+            for (size_t j = first; back && j < end; j += DISTI_SCENE_PIECE)
+                disti_scene_unpaint(&scene->placed[k], worker, &w, j, DISTI_MIN(end - j, (size_t)DISTI_SCENE_PIECE),
+                                    points + 3 * at, &pull);
         }
-        for (size_t j = 0; j < count; j++)
+        for (size_t j = 0; !back && j < count; j++)
             memcpy(color + 3 * (at + (size_t)w.order[j]), w.slope + 3 * j, 3 * sizeof(float));
     }
+}
+
+static void disti_scene_color(void *user, int worker, size_t n, const float *points, float *color)
+{
+    disti_scene_paint((const dist_scene *)user, worker, n, points, color, NULL);
+}
+
+static void disti_scene_color_adjoint(void *user, int worker, size_t n, const float *points, const float *d_color,
+                                      float *d_points, double *d_code, double *d_color_code)
+{
+    disti_scene_pull pull;
+    pull.d_color = d_color;
+    pull.d_points = d_points;
+    pull.d_code = d_code;
+    pull.d_color_code = d_color_code;
+    disti_scene_paint((const dist_scene *)user, worker, n, points, NULL, &pull);
 }
 
 /* Whether the field asks this scene, itself or through other scenes. */
@@ -3207,9 +3273,11 @@ static dist_status disti_scene_place(dist_scene *scene, int k, const dist_instan
     if (!create && disti_field_code(&next.field) != placed->code)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.code_size is %d, must stay what it was: %d", function,
                           (double)disti_field_code(&next.field), (double)placed->code);
-    if (!create && !next.field.color_fn != !placed->field.color_fn)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: a field with color and one without cannot replace each other",
-                          function, 0, 0);
+    if (!create && (!next.field.color_fn != !placed->field.color_fn ||
+                    !next.field.color_adjoint_fn != !placed->field.color_adjoint_fn ||
+                    next.field.color_code_size != placed->field.color_code_size))
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: what the instance has of color must stay what it was", function,
+                          0, 0);
     if (disti_scene_within(scene, &next.field))
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: the field is this scene's own", function, 0, 0);
     if (!disti_finite(s->scale) || s->scale < 0.0f)
@@ -3273,7 +3341,7 @@ DIST_API dist_scene *dist_scene_create(dist_context *ctx, int count, const dist_
 {
     const char *name = "dist_scene_create";
     disti_scene_work w;
-    size_t lanes;
+    size_t lanes, codes;
     if (disti_enter(ctx, name) != DIST_OK) return NULL;
     if (count < 1 || count > 1 << 20 || !instances) {
         disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: count is %d, must be 1 to 2^20; instances not NULL", name, count, 0);
@@ -3298,12 +3366,15 @@ DIST_API dist_scene *dist_scene_create(dist_context *ctx, int count, const dist_
         placed->code = disti_field_code(&placed->field);
         placed->offset = scene->code_size;
         scene->code_size += placed->code + 7;
-        if (scene->code_size > 0x7fffffffu) {
+        placed->color_offset = scene->color_code_size;
+        scene->color_code_size += (size_t)placed->field.color_code_size;
+        if (scene->code_size + scene->color_code_size > 0x7fffffffu) {
             disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: all codes together have more than 2^31 numbers", name, 0, 0);
             goto fail;
         }
     }
-    if (disti_partial_reserve(ctx, scene->code_size + scene->code_size / DISTI_SLOTS + 1) != DIST_OK) goto fail;
+    codes = scene->code_size + scene->color_code_size;
+    if (disti_partial_reserve(ctx, codes + codes / DISTI_SLOTS + 1) != DIST_OK) goto fail;
     return scene;
 fail:
     dist_scene_destroy(scene);
@@ -3346,7 +3417,9 @@ DIST_API dist_field dist_scene_field(dist_scene *scene)
     field.eval_fn = disti_scene_eval;
     field.fused_fn = disti_scene_fused;
     field.color_fn = disti_scene_color;
+    field.color_adjoint_fn = disti_scene_color_adjoint;
     field.code_size = (int)scene->code_size;
+    field.color_code_size = (int)scene->color_code_size;
     field.lipschitz = 1.0f;
     field.radius = disti_scene_bound(scene, field.center);
     for (int k = 0; k < scene->count; k++) {
@@ -3355,6 +3428,7 @@ DIST_API dist_field dist_scene_field(dist_scene *scene)
         field.lipschitz = DISTI_MAX(field.lipschitz, f->lipschitz);
         if (clamp > 0.0f && !(field.clamp > 0.0f && field.clamp < clamp)) field.clamp = clamp;
         if (!f->color_fn) field.color_fn = NULL;
+        if (!f->color_adjoint_fn) field.color_adjoint_fn = NULL;
     }
     return field;
 }

@@ -75,20 +75,24 @@ static inline void lit_end(lit *l)
     free(l->point);
 }
 
-/* blocked[i]: the ray from a little above point i along direction i meets the field within reach. */
+/* blocked[i]: the ray from a little above point i along direction i meets the field within reach (0: anywhere). */
 static inline void lit_trace(dist_context *ctx, const dist_field *field, const lit *l, size_t n, const size_t *which,
                              const float *directions, float reach, unsigned char *blocked)
 {
     float *origins = take_floats(3 * n);
+    dist_render_desc any;
+    memset(&any, 0, sizeof any);
+    any.any_hit = 1;
+    any.max_distance = reach;
     dist_hit *hits = (dist_hit *)take(n, sizeof *hits);
     for (size_t i = 0; i < 3 * n; i++) {
         size_t k = 3 * which[i / 3] + i % 3;
         origins[i] = l->point[k] + 4e-3f * l->radius * l->normal[k];
     }
-    dist_trace(ctx, field, n, origins, directions, NULL, hits, NULL);
+    dist_trace(ctx, field, n, origins, directions, &any, hits, NULL);
     check(ctx);
     for (size_t i = 0; i < n; i++) {
-        blocked[i] = hits[i].status == DIST_RAY_INSIDE || (hits[i].status == DIST_RAY_HIT && hits[i].distance < reach);
+        blocked[i] = hits[i].status == DIST_RAY_INSIDE || hits[i].status == DIST_RAY_HIT;
     }
     free(origins);
     free(hits);
@@ -108,7 +112,7 @@ static inline void lit_add(dist_context *ctx, const dist_field *field, const lit
         memcpy(directions + 3 * facing, toward, 3 * sizeof(float));
         which[facing++] = k;
     }
-    if (how->shadow) { lit_trace(ctx, field, l, facing, which, directions, 1e9f, blocked); }
+    if (how->shadow) { lit_trace(ctx, field, l, facing, which, directions, 0.0f, blocked); }
     for (size_t i = 0; i < facing; i++) {
         const float *n = l->normal + 3 * which[i];
         const float *p = l->point + 3 * which[i];

@@ -7,7 +7,8 @@
 enum { SIZE = 20, PIXELS = SIZE * SIZE, POINTS = 60, MOST = 4096 };
 
 /* A ball-like geometry and what colors it: a texture of its own code, or three more channels of the same net. In
-   double: numbers[] = rotation vector, translation, code, color code, the geometry's weights, the texture's. */
+   double: numbers[] = rotation vector, translation, lens, placement, code, color code, the geometry's weights, the
+   texture's. */
 typedef struct scene {
     const char *name;
     model shape, texture; /* texture.layers = 0: the channels are the geometry's */
@@ -18,23 +19,54 @@ typedef struct scene {
     dist_net *net[2];
     dist_shape *painted;
     dist_field field;
+    dist_scene *placed; /* the shape where the placement says, and once more, out of sight; NULL: it is where it is */
 } scene;
 
-enum { TURN, MOVE = 3, CODES = 6 }; /* places in numbers[] */
+/* Places in numbers[]: of a placement log-scale, w of exp([w]x) R, translation. */
+enum { TURN, MOVE = 3, LENS = 6, PLACE = 10, CODES = 17 };
+
+static const double place_scale = 1.1, place_turn[9] = {0.8, -0.6, 0, 0.6, 0.8, 0, 0, 0, 1};
+
+/* exp(-[w]x) a. */
+static void turn_back(const double w[3], const double a[3], double b[3])
+{
+    double angle = sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2]);
+    double sine = angle > 0.0 ? sin(angle) / angle : 1.0, c = angle > 0.0 ? (1.0 - cos(angle)) / (angle * angle) : 0.5;
+    double x[3] = {a[1] * w[2] - a[2] * w[1], a[2] * w[0] - a[0] * w[2], a[0] * w[1] - a[1] * w[0]};
+    double y[3] = {x[1] * w[2] - x[2] * w[1], x[2] * w[0] - x[0] * w[2], x[0] * w[1] - x[1] * w[0]};
+    for (int i = 0; i < 3; i++) b[i] = a[i] + sine * x[i] + c * y[i];
+}
+
+/* q = R^T exp(-[w]x) (p - t) / (s exp(log-scale)) */
+static void to_local(const scene *s, const double p[3], double q[3])
+{
+    double x[3], turned[3], scale = place_scale * exp(s->numbers[PLACE]);
+    memcpy(q, p, 3 * sizeof(double));
+    if (!s->placed) return;
+    for (int i = 0; i < 3; i++) x[i] = (p[i] - s->numbers[PLACE + 4 + i]) / scale;
+    turn_back(s->numbers + PLACE + 1, x, turned);
+    for (int i = 0; i < 3; i++) {
+        q[i] = 0.0;
+        for (int k = 0; k < 3; k++) q[i] += place_turn[3 * k + i] * turned[k];
+    }
+}
 
 static const double *numbers_of_weights(const scene *s) { return s->numbers + CODES + s->code + s->color_code; }
 
 static double distance_at(const scene *s, const double p[3])
 {
-    return model_eval(&s->shape, numbers_of_weights(s), s->numbers + CODES, p);
+    double q[3];
+    to_local(s, p, q);
+    return model_eval(&s->shape, numbers_of_weights(s), s->numbers + CODES, q);
 }
 
 static void color_at(const scene *s, const double p[3], double color[3], double *closest)
 {
     const model *m = s->texture.layers ? &s->texture : &s->shape;
     const double *weights = numbers_of_weights(s) + (s->texture.layers ? s->weights : 0);
-    double channels[8];
-    model_channels(m, weights, s->numbers + CODES, p, channels, NULL, closest);
+    double channels[8], q[3];
+    to_local(s, p, q);
+    model_channels(m, weights, s->numbers + CODES, q, channels, NULL, closest);
     memcpy(color, channels + (m->sdf_channel == 0), 3 * sizeof(double));
 }
 
@@ -99,13 +131,35 @@ static void scene_open(scene *s, int k, int workers)
     s->field = dist_shape_field(s->painted);
     s->camera = dist_camera_look_at(SIZE, SIZE, 0.9f, eye, at, up);
     for (int i = 0; i < 3; i++) s->numbers[MOVE + i] = (double)s->camera.translation[i];
+    const float lens[4] = {s->camera.fx, s->camera.fy, s->camera.cx, s->camera.cy};
+    for (int i = 0; i < 4; i++) s->numbers[LENS + i] = (double)lens[i];
     MODEL_CHECK(s->field.color_adjoint_fn != NULL, s->name, dist_context_message(s->ctx), 0, 0);
     CHECK_EQUAL(s->color_code, s->field.color_code_size);
     CHECK_EQUAL(s->color_weights, s->field.color_weight_count);
 }
 
+/* Turns the scene into one with its shape placed. */
+static void scene_place(scene *s)
+{
+    static const float move[3] = {0.125f, -0.0625f, 0.1875f};
+    dist_instance instances[2];
+    memset(instances, 0, sizeof instances);
+    instances[0].field = instances[1].field = &s->field;
+    instances[1].placement.translation[0] = -30.0f;
+    instances[0].placement.scale = (float)place_scale;
+    for (int i = 0; i < 9; i++) instances[0].placement.rotation[i] = (float)place_turn[i];
+    memcpy(instances[0].placement.translation, move, sizeof move);
+    for (int i = 0; i < 3; i++) s->numbers[PLACE + 4 + i] = (double)move[i];
+    s->placed = dist_scene_create(s->ctx, 2, instances);
+    s->field = dist_scene_field(s->placed);
+    MODEL_CHECK(s->field.color_adjoint_fn != NULL, s->name, dist_context_message(s->ctx), 0, 0);
+    CHECK_EQUAL(2 * s->color_code, s->field.color_code_size);
+    CHECK_EQUAL(2 * (s->code + 7), s->field.code_size);
+}
+
 static void scene_close(scene *s)
 {
+    dist_scene_destroy(s->placed);
     dist_shape_destroy(s->painted);
     dist_net_destroy(s->net[0]);
     dist_net_destroy(s->net[1]);
@@ -122,6 +176,8 @@ static dist_gradients gradients_of(const scene *s, float *g)
     memset(g, 0, MOST * sizeof(float));
     grads.rotation = g + TURN;
     grads.translation = g + MOVE;
+    grads.focal = g + LENS;
+    grads.principal = g + LENS + 2;
     if (s->code) grads.code = g + CODES;
     if (s->color_code) grads.color_code = g + CODES + s->code;
     grads.weights = g + CODES + s->code + s->color_code;
@@ -196,7 +252,7 @@ TEST(color_backward_at_points_matches_differences)
             for (int j = 0; j < 3; j++) CHECK_NEAR(c[j], color[3 * i + j], 2e-5);
         }
         dist_gradients grads = gradients_of(&s, g);
-        grads.rotation = grads.translation = NULL;
+        grads.rotation = grads.translation = grads.focal = grads.principal = NULL;
         if (s.color_weights) grads.weights = NULL;
         memset(d_points, 0, sizeof d_points);
         CHECK_STATUS(DIST_OK, dist_color_backward(s.ctx, &s.field, POINTS, points, d_color, d_points, &grads), s.ctx);
@@ -231,12 +287,8 @@ typedef struct image_job {
 /* exp(-[w]x) a, then R^T. */
 static void to_world(const scene *s, const double a[3], double b[3])
 {
-    const double *w = s->numbers + TURN;
-    double angle = sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2]), turned[3];
-    double sine = angle > 0.0 ? sin(angle) / angle : 1.0, c = angle > 0.0 ? (1.0 - cos(angle)) / (angle * angle) : 0.5;
-    double x[3] = {a[1] * w[2] - a[2] * w[1], a[2] * w[0] - a[0] * w[2], a[0] * w[1] - a[1] * w[0]};
-    double y[3] = {x[1] * w[2] - x[2] * w[1], x[2] * w[0] - x[0] * w[2], x[0] * w[1] - x[1] * w[0]};
-    for (int i = 0; i < 3; i++) turned[i] = a[i] + sine * x[i] + c * y[i];
+    double turned[3];
+    turn_back(s->numbers + TURN, a, turned);
     for (int i = 0; i < 3; i++) {
         b[i] = 0.0;
         for (int k = 0; k < 3; k++) b[i] += (double)s->camera.rotation[3 * k + i] * turned[k];
@@ -246,8 +298,8 @@ static void to_world(const scene *s, const double a[3], double b[3])
 /* The hit of a pixel's ray near distance t by the secant rule: 0, or its distance; p its place. */
 static double hit_near(const scene *s, int pixel, double t, double p[3], double direction[3])
 {
-    double d[3] = {(pixel % SIZE - (double)s->camera.cx) / (double)s->camera.fx,
-                   (pixel / SIZE - (double)s->camera.cy) / (double)s->camera.fy, 1.0};
+    const double *lens = s->numbers + LENS;
+    double d[3] = {(pixel % SIZE - lens[2]) / lens[0], (pixel / SIZE - lens[3]) / lens[1], 1.0};
     double length = sqrt(d[0] * d[0] + d[1] * d[1] + 1.0), minus[3], o[3], before = t - 1e-3, f_before = 0.0;
     for (int i = 0; i < 3; i++) {
         d[i] /= length;
@@ -308,57 +360,147 @@ static dist_tape *pictures_take(pictures *a, scene *s)
     return tape;
 }
 
+/* Fills job and the upstream gradient with the pixels to compare; the others' is 0. */
+static void pixels_choose(const scene *s, pictures *a, image_job *job)
+{
+    int used = 0, excluded = 0;
+    test_random random = test_random_seed(8);
+    memset(job, 0, sizeof *job);
+    for (int i = 0; i < PIXELS; i++) {
+        double p[3], q[3], v[3], color[3], closest[2], slope = 0.0, size = 0.0;
+        if (!a->mask[i]) {
+            CHECK_NEAR(0.5, a->color[3 * i + 1], 0);
+            a->d_color[3 * i] = 1.0f; /* a miss has no color to pull on */
+            continue;
+        }
+        double t = hit_near(s, i, (double)a->distance[i], p, v);
+        to_local(s, p, q);
+        model_channels(&s->shape, numbers_of_weights(s), s->numbers + CODES, q, NULL, NULL, &closest[0]);
+        color_at(s, p, color, &closest[1]);
+        for (int j = 0; j < 3; j++) {
+            double moved[3] = {p[0], p[1], p[2]}, d;
+            moved[j] += 1e-6;
+            d = distance_at(s, moved) / 1e-6;
+            slope += d * v[j];
+            size += d * d;
+        }
+        int bad = closest[0] < 5e-4 || closest[1] < 5e-4 || slope > -0.15 * sqrt(size) ||
+                  fabs(t - (double)a->distance[i]) > 1e-3;
+        used += !bad;
+        excluded += bad;
+        if (bad) continue;
+        job->t[i] = t;
+        for (int j = 0; j < 3; j++) {
+            CHECK_NEAR(color[j], a->color[3 * i + j], 1e-3);
+            a->d_color[3 * i + j] = test_random_float(&random, -0.2f, 1.0f);
+            job->weight[3 * i + j] = (double)a->d_color[3 * i + j];
+        }
+    }
+    MODEL_CHECK(used >= 50 && 10 * excluded <= used + excluded, s->name, "pixels excluded", used, excluded);
+}
+
 TEST(color_backward_of_pictures_matches_differences)
 {
     static float g[MOST];
     static pictures a;
+    static image_job job;
     for (int k = 0; k < PAIRS; k++) {
         scene s;
-        image_job job;
-        int used = 0, excluded = 0;
-        test_random random = test_random_seed(8);
-        memset(&job, 0, sizeof job);
         scene_open(&s, k, 1);
         dist_tape *tape = pictures_take(&a, &s);
-        for (int i = 0; i < PIXELS; i++) {
-            double p[3], v[3], color[3], closest[2], slope = 0.0, size = 0.0;
-            if (!a.mask[i]) {
-                CHECK_NEAR(0.5, a.color[3 * i + 1], 0);
-                a.d_color[3 * i] = 1.0f; /* a miss has no color to pull on */
-                continue;
-            }
-            double t = hit_near(&s, i, (double)a.distance[i], p, v);
-            model_channels(&s.shape, numbers_of_weights(&s), s.numbers + CODES, p, NULL, NULL, &closest[0]);
-            color_at(&s, p, color, &closest[1]);
-            for (int j = 0; j < 3; j++) {
-                double q[3] = {p[0], p[1], p[2]}, d;
-                q[j] += 1e-6;
-                d = distance_at(&s, q) / 1e-6;
-                slope += d * v[j];
-                size += d * d;
-            }
-            int bad = closest[0] < 5e-4 || closest[1] < 5e-4 || slope > -0.15 * sqrt(size) ||
-                      fabs(t - (double)a.distance[i]) > 1e-3;
-            used += !bad;
-            excluded += bad;
-            if (bad) continue;
-            job.t[i] = t;
-            for (int j = 0; j < 3; j++) {
-                CHECK_NEAR(color[j], a.color[3 * i + j], 1e-3);
-                a.d_color[3 * i + j] = test_random_float(&random, -0.2f, 1.0f);
-                job.weight[3 * i + j] = (double)a.d_color[3 * i + j];
-            }
-        }
-        MODEL_CHECK(used >= 50 && 10 * excluded <= used + excluded, s.name, "pixels excluded", used, excluded);
+        pixels_choose(&s, &a, &job);
         dist_gradients grads = gradients_of(&s, g);
         CHECK_STATUS(DIST_OK, dist_render_backward(s.ctx, tape, &a.d_out, &grads), s.ctx);
         int at = CODES + s.code + s.color_code;
         compare(&s, "rotation", TURN, 3, g, image_loss, &job, 5e-4);
         compare(&s, "translation", MOVE, 3, g, image_loss, &job, 5e-4);
+        compare(&s, "focal lengths", LENS, 2, g, image_loss, &job, 5e-4);
+        compare(&s, "principal point", LENS + 2, 2, g, image_loss, &job, 5e-4);
         compare(&s, "code", CODES, s.code, g, image_loss, &job, 5e-4);
         compare(&s, "color code", CODES + s.code, s.color_code, g, image_loss, &job, 5e-4);
         compare(&s, "weights", at, s.weights, g, image_loss, &job, 5e-4);
         compare(&s, "texture's weights", at + s.weights, s.color_weights, g, image_loss, &job, 5e-4);
+        dist_tape_destroy(tape);
+        scene_close(&s);
+    }
+}
+
+TEST(color_backward_of_placed_shapes_matches_differences)
+{
+    static float g[MOST];
+    static pictures a;
+    static image_job job;
+    for (int k = 0; k < PAIRS; k++) {
+        scene s;
+        float both[2 * (MODEL_CODE + 7)], colors[2 * MODEL_CODE];
+        memset(both, 0, sizeof both);
+        memset(colors, 0, sizeof colors);
+        scene_open(&s, k, 1);
+        scene_place(&s);
+        dist_tape *tape = pictures_take(&a, &s);
+        pixels_choose(&s, &a, &job);
+        dist_gradients grads = gradients_of(&s, g);
+        grads.code = both;
+        if (s.color_code) grads.color_code = colors;
+        grads.weights = grads.color_weights = NULL;
+        CHECK_STATUS(DIST_OK, dist_render_backward(s.ctx, tape, &a.d_out, &grads), s.ctx);
+        memcpy(g + PLACE, both + s.code, 7 * sizeof(float));
+        memcpy(g + CODES, both, (size_t)s.code * sizeof(float));
+        memcpy(g + CODES + s.code, colors, (size_t)s.color_code * sizeof(float));
+        for (int i = 0; i < s.code + 7; i++) CHECK_NEAR(0, both[s.code + 7 + i], 0); /* out of sight */
+        for (int i = 0; i < s.color_code; i++) CHECK_NEAR(0, colors[s.color_code + i], 0);
+        compare(&s, "translation of the camera", MOVE, 3, g, image_loss, &job, 5e-4);
+        compare(&s, "scale", PLACE, 1, g, image_loss, &job, 5e-4);
+        compare(&s, "placed rotation", PLACE + 1, 3, g, image_loss, &job, 5e-4);
+        compare(&s, "placed translation", PLACE + 4, 3, g, image_loss, &job, 5e-4);
+        compare(&s, "code, placed", CODES, s.code, g, image_loss, &job, 5e-4);
+        compare(&s, "color code, placed", CODES + s.code, s.color_code, g, image_loss, &job, 5e-4);
+        dist_tape_destroy(tape);
+        scene_close(&s);
+    }
+}
+
+/* The color's own part does not depend on how the distance's gradient is taken; and codes are found by it. */
+TEST(a_color_code_is_recovered_from_one_picture_with_either_tracer)
+{
+    static pictures target, a;
+    for (int paper = 0; paper < 2; paper++) {
+        scene s;
+        dist_render_desc how;
+        dist_adam adam;
+        dist_gradients grads;
+        float code[3], wanted[3] = {0.4f, -0.6f, 0.3f}, d_code[3], moments[6] = {0, 0, 0, 0, 0, 0}, first = 0, loss = 0;
+        memset(&how, 0, sizeof how);
+        memset(&adam, 0, sizeof adam);
+        memset(&grads, 0, sizeof grads);
+        memset(code, 0, sizeof code);
+        scene_open(&s, 0, 1);
+        how.trace = paper ? DIST_TRACE_PAPER : DIST_TRACE_GUARDED;
+        adam.moments = moments;
+        adam.rate = 0.05f;
+        grads.color_code = d_code;
+        dist_tape *tape = dist_tape_create(s.ctx, &s.camera, &how);
+        memset(&target, 0, sizeof target);
+        target.out.color = target.color;
+        dist_shape_set_color_code(s.painted, wanted);
+        CHECK_STATUS(DIST_OK, dist_render(s.ctx, &s.field, &s.camera, &how, &target.out, NULL), s.ctx);
+        memset(&a, 0, sizeof a);
+        a.out.color = a.color;
+        a.out.mask = a.mask;
+        a.d_out.color = a.d_color;
+        for (int step = 0; step < 400; step++) {
+            memset(a.d_color, 0, sizeof a.d_color);
+            memset(d_code, 0, sizeof d_code);
+            dist_shape_set_color_code(s.painted, code);
+            dist_render(s.ctx, &s.field, &s.camera, &how, &a.out, tape);
+            loss = dist_loss_color(PIXELS, a.color, target.color, a.mask, 1.0f, a.d_color);
+            if (step == 0) first = loss;
+            adam.rate = 0.05f * (1.0f - (float)step / 400.0f);
+            CHECK_STATUS(DIST_OK, dist_render_backward(s.ctx, tape, &a.d_out, &grads), s.ctx);
+            dist_adam_step(&adam, 3, code, d_code);
+        }
+        CHECK(loss < 0.02f * first);
+        CHECK_NEAR_ARRAY(3, wanted, code, 0.02);
         dist_tape_destroy(tape);
         scene_close(&s);
     }
@@ -378,7 +520,7 @@ TEST(color_gradients_have_the_same_bits_for_every_number_of_workers_and_whatever
             dist_gradients grads = gradients_of(&s, g[run]);
             if (run == 2) { /* the color's own alone */
                 if (s.color_weights) grads.code = grads.weights = NULL;
-                grads.rotation = grads.translation = NULL;
+                grads.rotation = grads.translation = grads.focal = grads.principal = NULL;
             }
             CHECK_STATUS(DIST_OK, dist_render_backward(s.ctx, tape, &a.d_out, &grads), s.ctx);
             size_t own = (size_t)(CODES + s.code), bytes = sizeof(float);
@@ -453,7 +595,7 @@ TEST(a_texture_that_does_not_fit_and_gradients_that_are_not_there_are_refused)
     CHECK_EQUAL(DIST_BAD_ARGUMENT, dist_shape_set_texture(NULL, s.net[1], NULL));
     dist_gradients grads = gradients_of(&s, g);
     CHECK_STATUS(DIST_BAD_ARGUMENT, dist_color_backward(s.ctx, &s.field, 1, x, x, NULL, &grads), s.ctx); /* camera */
-    grads.rotation = grads.translation = NULL;
+    grads.rotation = grads.translation = grads.focal = grads.principal = NULL;
     CHECK_STATUS(DIST_UNSUPPORTED, dist_color_backward(s.ctx, &s.field, 1, x, x, NULL, &grads), s.ctx); /* weights */
     CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_backward(s.ctx, &s.field, 1, x, x, NULL, NULL, NULL, &grads), s.ctx);
     float sphere[4] = {0, 0, 0, 0.5f};
@@ -614,6 +756,8 @@ int main(int argc, char **argv)
     test_begin(argc, argv);
     RUN(color_backward_at_points_matches_differences);
     RUN(color_backward_of_pictures_matches_differences);
+    RUN(color_backward_of_placed_shapes_matches_differences);
+    RUN(a_color_code_is_recovered_from_one_picture_with_either_tracer);
     RUN(color_gradients_have_the_same_bits_for_every_number_of_workers_and_whatever_else_is_wanted);
     RUN(color_queries_are_counted_and_none_made_where_no_color_is_asked_for);
     RUN(codes_of_a_textured_shape_are_set_one_by_one);

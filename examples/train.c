@@ -32,6 +32,7 @@ static const char usage[] =
     "  --rate R           Adam's rate at the start, falling to nothing along a cosine (default 0.003)\n"
     "  --code-rate R      the same for the codes, which have their turn more rarely (default 0.015)\n"
     "  --prior W          weight of |code|^2 (default 0.0001)\n"
+    "  --eikonal W        weight of (|grad f| - 1)^2 at the samples (default 0: none)\n"
     "  --seed S           (default 1)\n"
     "  --threads N        (default all)\n"
     "  --resume FILE      goes on with a model's weights and codes\n"
@@ -53,7 +54,7 @@ typedef struct settings {
     int count, held_out, samples, resolution, iterations;
     unsigned seed;
     double minutes;
-    float rate, code_rate, prior;
+    float rate, code_rate, prior, eikonal;
     const char *resume, *out, *header, *evaluate, *color;
 } settings;
 
@@ -222,6 +223,7 @@ typedef struct trainer {
     float *points, *target, *d_sdf, *loss;
     size_t *order; /* the shapes in the order of this pass */
     size_t next;
+    double slope_error; /* mean (|grad f| - 1)^2 of the last steps, where --eikonal asks for it */
     rng random;
 } trainer;
 
@@ -340,7 +342,7 @@ static double trainer_step(trainer *t, double done)
     size_t batch = (size_t)how->batch;
     float decay = 0.5f + 0.5f * cosf(PI * (float)done) + 1e-3f;
     float prior = how->prior * (float)(done < 0.1 ? done / 0.1 : 1.0);
-    double loss = 0.0;
+    double loss = 0.0, slope_error = 0.0;
     memset(t->d_weights, 0, t->weight_count * sizeof(float));
     for (int i = 0; i < how->group; i++) {
         size_t k = trainer_next(t);
@@ -356,10 +358,16 @@ static double trainer_step(trainer *t, double done)
         dist_shape_set_code(t->shape, code);
         dist_field field = dist_shape_field(t->shape);
         dist_field_backward(t->ctx, &field, batch, t->points, t->d_sdf, clamped_loss_seed, &l, NULL, &grads);
+        if (how->eikonal > 0.0f) {
+            float term;
+            dist_field_eikonal(t->ctx, &field, batch, t->points, how->eikonal, &term, &grads);
+            slope_error += (double)(term / how->eikonal) / how->group;
+        }
         t->code_adam[k].rate = how->code_rate * decay;
         dist_adam_step(&t->code_adam[k], t->code_size, code, t->d_code);
         loss += mean_of(batch, t->loss) / how->group;
     }
+    t->slope_error = done > 0.0 ? 0.95 * t->slope_error + 0.05 * slope_error : slope_error;
     t->adam.rate = how->rate * decay;
     dist_adam_step(&t->adam, t->weight_count, t->weights, t->d_weights);
     dist_net_set_weights(t->ctx, t->net, t->weights);
@@ -391,6 +399,7 @@ static void train(dist_context *ctx, const settings *how, trainer *t)
     printf("%.0f shapes, %.0f weights, %d steps in %.0f s (sampling %.0f s): loss %.5f, length of a code %.3f\n",
            (double)t->shape_count, (double)t->weight_count, step, seconds_now() - began, began - start, loss,
            sqrt(squares / (double)t->shape_count));
+    if (how->eikonal > 0.0f) printf("|grad f| at the samples is off 1 by %.4f (rms)\n", sqrt(t->slope_error));
 }
 
 /* The model file as little-endian words, for programs that carry it with them. what: "model" or "texture". */
@@ -752,6 +761,7 @@ static int parse_training(options *o, settings *how)
     else if (option_is(o, "--batch")) how->batch = option_int(o, 1, 1000000);
     else if (option_is(o, "--rate")) how->rate = (float)option_number(o, 1e-9, 1.0);
     else if (option_is(o, "--code-rate")) how->code_rate = (float)option_number(o, 1e-9, 1.0);
+    else if (option_is(o, "--eikonal")) how->eikonal = (float)option_number(o, 0.0, 1e6);
     else if (option_is(o, "--resume")) how->resume = option_text(o);
     else if (option_is(o, "--out")) how->out = option_text(o);
     else if (option_is(o, "--header")) how->header = option_text(o);

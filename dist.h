@@ -457,6 +457,9 @@ typedef struct dist_render_desc {
     float background;    /* depth and distance at a miss */
     float background_color[3];
     float lipschitz;     /* 0: the field's */
+    float relax_band; /* above 0, with a tape: d_out's color beside the outline says where it is to go, by the rays that
+                         miss by less than this, shape units: one or two pixels' width. For losses that compare color
+                         without a mask; 0: off */
     int no_cones;        /* 1: every ray marches from the bounding sphere by itself */
     int no_prediction;   /* 1: no ray starts from what its neighbors found */
     /* dist_trace only. any_hit 1: a ray ends as soon as anything is certain to block it, for shadows; its distance is
@@ -559,7 +562,7 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
 
 #ifndef DIST_NO_BACKWARD
 /* Adjoint of the dist_render that filled the tape: reads d_out's depth, distance, normal, silhouette, color; adds to
-   grads.
+   grads; with how.relax_band color also at misses: outlines move, though not those that lie before another surface.
    d_out->stats, if given, gets capped, backward_points and skipped added. No allocator call. */
 DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *tape, const dist_images *d_out,
                                           const dist_gradients *grads);
@@ -6682,6 +6685,9 @@ static dist_status disti_how_check(dist_context *ctx, const dist_render_desc *ho
     if (!disti_finite(how->lipschitz) || how->lipschitz < 0.0f)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.lipschitz is %d, must be 0 or positive", function,
                           (double)how->lipschitz, 0);
+    if (!disti_finite(how->relax_band) || how->relax_band < 0.0f)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.relax_band is %d, must be 0 or positive", function,
+                          (double)how->relax_band, 0);
     if (!disti_finite(how->background) || !disti_finite_all(3, how->background_color))
         return disti_fail(ctx, DIST_NOT_FINITE, "%s: how.background and background_color must be finite", function, 0,
                           0);
@@ -8218,7 +8224,8 @@ struct dist_tape {
     float *hit, *d_color, *pull, *bend; /* (DISTI_RUN, 3): hits, dL/dcolor, dL/dpoint by color and by normal */
 };
 
-enum { DISTI_TAPE_HIT = 16, DISTI_TAPE_SAMPLE = 32 }; /* counts as a hit; has a sample of smallest |f| */
+/* counts as a hit; has a sample of smallest |f|; misses by less than how.relax_band */
+enum { DISTI_TAPE_HIT = 16, DISTI_TAPE_SAMPLE = 32, DISTI_TAPE_NEAR = 64 };
 
 static size_t disti_tape_bytes(const dist_tape *tape, int part)
 {
@@ -8315,6 +8322,7 @@ typedef struct disti_render_job {
     dist_tape *tape;
     int tile, across;
     int predict; /* pixels start from what their neighbors found */
+    int least;   /* misses need their smallest f: for the silhouette or the relaxed boundary */
     size_t first[DISTI_LIST_TASKS + 1]; /* disti_render_list: first pixel of each task */
     size_t each;                        /* and how many of them each has */
     int count;                          /* tasks */
@@ -8509,7 +8517,11 @@ static void disti_render_pixel(const disti_render_job *job, const disti_ray *ray
     int sampled = ray->enter < ray->leave && ray->fbest < 2e38f && ray->status != DIST_RAY_NOT_FINITE;
     job->tape->s[pixel] = ray->best;
     job->tape->status[pixel] = (unsigned char)(ray->status | (ray->status == DIST_RAY_HIT ? DISTI_TAPE_HIT : 0) |
-                                               (sampled ? DISTI_TAPE_SAMPLE : 0));
+                                               (sampled ? DISTI_TAPE_SAMPLE : 0) |
+                                               (sampled && ray->status == DIST_RAY_MISS && ray->fbest > 0.0f &&
+                                                        ray->fbest < job->tracer->how.relax_band
+                                                    ? DISTI_TAPE_NEAR
+                                                    : 0));
 }
 
 static void disti_render_planes(const disti_render_job *job, const disti_tile *tile, const disti_bench *bench)
@@ -8574,7 +8586,7 @@ static void disti_render_task(void *arg, int index, int worker)
     } else
 #endif
     {
-        unsigned long long kept = job->out->silhouette ? budget.left / 4 : 0; /* for the silhouette of misses */
+        unsigned long long kept = job->least ? budget.left / 4 : 0; /* for the smallest f of misses */
         budget.left -= kept;
         if (!tracer->how.no_cones)
             disti_cones(tracer, worker, &tile, &bench, predict ? (int)DISTI_LATTICE : (int)DISTI_CONE_LEAF);
@@ -8585,7 +8597,7 @@ static void disti_render_task(void *arg, int index, int worker)
         disti_tile_trim(&tile, &bench);
         disti_trace_end(&bench, (size_t)(tile.width * tile.height));
         budget.left += kept;
-        if (job->out->silhouette) disti_silhouette(tracer, worker, &tile, &bench);
+        if (job->least) disti_silhouette(tracer, worker, &tile, &bench);
     }
     disti_render_planes(job, &tile, &bench);
     if (job->out->normal) disti_render_normals(job, worker, &tile, &bench);
@@ -8599,7 +8611,7 @@ static int disti_render_list(const disti_tracer *tracer, const disti_view *view,
 {
     const unsigned char *pixels = tracer->how.pixels;
     size_t n = (size_t)view->width * (size_t)view->height, wanted = 0, pairs = 0;
-    if (!pixels || job->out->silhouette || tracer->how.trace != DIST_TRACE_GUARDED) return 0;
+    if (!pixels || job->least || tracer->how.trace != DIST_TRACE_GUARDED) return 0;
     for (size_t i = 0; i < n; i++) {
         wanted += pixels[i] != 0;
         pairs += pixels[i] && i + 1 < n && pixels[i + 1];
@@ -8697,6 +8709,7 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
                                                                                                         : DISTI_TILE;
     job.across = (view.width + job.tile - 1) / job.tile;
     job.predict = disti_render_predicts(&tracer, &view);
+    job.least = out->silhouette || (tape && tracer.how.relax_band > 0.0f);
     int listed = disti_render_list(&tracer, &view, &job);
     job.count = listed ? listed : job.across * ((view.height + job.tile - 1) / job.tile);
     disti_sphere_box(&view, field, job.box);
@@ -8704,7 +8717,7 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     disti_stats_end(ctx, &tracer, out->stats);
     if (!tape) return DIST_OK;
     tape->rendered = 1;
-    tape->has_silhouette = out->silhouette != NULL;
+    tape->has_silhouette = job.least;
     tape->field = *field;
     tape->camera = *camera;
     tape->tracer = tracer;
@@ -8732,6 +8745,13 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
               ReLU net's normal has; in the difference mode by those of the normal itself.
    color      c = g(p, z, color code) at the hit p = o + t v: y = (dg/dp)^T d_c, d_t += y . v; z, the color code and the
               color's weights receive dg's own part.
+   outline    color is c_in where m = min over t of f(o + t v) is below 0 and c_out where it is above, so that its sum
+              over the picture changes by the integral of delta(m) (c_out - c_in) dm, of which single rays see nothing.
+              delta(m) is relaxed to 1 / band on 0 < m < band: the seed d_c . (c_out - c_in) / band at the sample of
+              smallest f of rays that miss by less. c_in: of the surface next to it, by one step of Newton; d_c:
+              interpolated where that point is seen, since the outline has pixels on both sides; c_out: background.
+              (Wang, Deng, Zhang, Jakob, Marschner, "A Simple Approach to Differentiable Rendering of SDFs", 2024, whose
+              band this is, with one ray a pixel; theirs also sees one surface before another.)
 
    All of them end as seeds a on df and pulls y, which disti_add_pull brings to the camera; and a normal in camera space
    turns with it: d_rotation += n x d_n.                                                                       */
@@ -9024,6 +9044,70 @@ static void disti_backward_colors(disti_render_backward_job *job, size_t first, 
     job->colored = 0;
 }
 
+/* dL/dcolor between pixels, bilinear, at the place where point p is seen. */
+static void disti_upstream_between(const disti_render_backward_job *job, const float p[3], float d_color[3])
+{
+    const disti_view *view = &job->view;
+    double world[3], q[3], at[2], size[2] = {view->width - 1.0, view->height - 1.0};
+    int low[2];
+    for (int i = 0; i < 3; i++) world[i] = (double)p[i];
+    disti_rotate(view->rotation, world, q);
+    for (int i = 0; i < 3; i++) q[i] += view->translation[i];
+    memset(d_color, 0, 3 * sizeof(float));
+    if (!(q[2] > 0.0)) return;
+    at[0] = (view->fx * q[0] + view->skew * q[1]) / q[2] + view->cx - view->first;
+    at[1] = view->fy * q[1] / q[2] + view->cy - view->first;
+    for (int i = 0; i < 2; i++) {
+        at[i] = DISTI_MIN(DISTI_MAX(at[i], 0.0), size[i]);
+        low[i] = (int)at[i];
+        at[i] -= low[i];
+    }
+    for (int corner = 0; corner < 4; corner++) {
+        int right = corner & 1, below = corner >> 1;
+        double share = (right ? at[0] : 1.0 - at[0]) * (below ? at[1] : 1.0 - at[1]);
+        if (!(share > 0.0)) continue; /* also what is beyond the edge */
+        size_t pixel = (size_t)(low[1] + below) * (size_t)view->width + (size_t)(low[0] + right);
+        for (size_t k = 0; k < 3; k++) d_color[k] += (float)share * disti_upstream(job->d_out->color, 3 * pixel + k);
+    }
+}
+
+/* The outline's seeds of `count` pixels, at most DISTI_RUN. */
+static void disti_backward_outline(disti_render_backward_job *job, size_t first, size_t count)
+{
+    const dist_tape *tape = job->tape;
+    const dist_field *field = &tape->field;
+    const dist_render_desc *how = &tape->tracer.how;
+    float *p = tape->hit, *surface = tape->d_points, *color = tape->pull, *seed = tape->d_color, d_color[3];
+    disti_ray ray;
+    double local[3];
+    size_t n = 0;
+    for (size_t pixel = first; pixel < first + count; pixel++) {
+        if (!(tape->status[pixel] & DISTI_TAPE_NEAR)) continue;
+        disti_pixel_ray(&job->view, field, (int)(pixel % (size_t)tape->width), (int)(pixel / (size_t)tape->width),
+                        local, &ray);
+        disti_ray_point(&ray, tape->s[pixel], p + 3 * n);
+        if (tape->sample) memcpy(p + 3 * n, tape->sample + pixel * (size_t)tape->samples * 4 + 1, 3 * sizeof(float));
+        n++;
+    }
+    if (n == 0) return;
+    disti_field_eval_all(job->ctx, field, n, p, tape->d_sdf, surface);
+    for (size_t i = 0; i < n; i++) {
+        float *g = surface + 3 * i, square = g[0] * g[0] + g[1] * g[1] + g[2] * g[2];
+        float step = disti_finite(square) && square > 1e-20f ? tape->d_sdf[i] / square : 0.0f;
+        for (size_t k = 0; k < 3; k++) g[k] = p[3 * i + k] - (step != 0.0f ? step * g[k] : 0.0f);
+    }
+    field->color_fn(field->user, 0, n, surface, color);
+    for (size_t i = 0; i < n; i++) {
+        float sum = 0.0f;
+        disti_upstream_between(job, surface + 3 * i, d_color);
+        for (size_t k = 0; k < 3; k++) sum += d_color[k] * (how->background_color[k] - color[3 * i + k]);
+        seed[i] = disti_finite(sum) ? sum / how->relax_band : 0.0f;
+    }
+    memset(&ray, 0, sizeof ray); /* a seed asks for no direction */
+    for (size_t i = 0; i < n; i++)
+        if (seed[i] != 0.0f) disti_backward_add(job, &ray, p + 3 * i, 0.0f, 0.0f, seed[i]);
+}
+
 static void disti_backward_pixels(disti_render_backward_job *job)
 {
     const dist_tape *tape = job->tape;
@@ -9036,6 +9120,8 @@ static void disti_backward_pixels(disti_render_backward_job *job)
         int asked = tape->status[pixel] != DIST_RAY_SKIPPED;
         float d_silhouette = asked ? disti_upstream(d_out->silhouette, pixel) : 0.0f;
         float d[3];
+        if (job->geometry && d_out->color && tape->tracer.how.relax_band > 0.0f && pixel % DISTI_RUN == 0)
+            disti_backward_outline(job, pixel, DISTI_MIN(pixels - pixel, (size_t)DISTI_RUN));
         if (d_out->color && pixel % DISTI_RUN == 0)
             disti_backward_colors(job, pixel, DISTI_MIN(pixels - pixel, (size_t)DISTI_RUN));
         if (d_out->normal && job->geometry && pixel % DISTI_RUN == 0)

@@ -21,6 +21,7 @@ static const char usage[] =
     "  --normal-delta D   normals by differences over D to either side, which smooths facets (default analytic)\n"
     "  --threads N        threads to use at most (default all)\n"
     "  --turntable N      N shaded frames around the vertical axis and one sheet of them, in place of the planes\n"
+    "  --relight N        N more pictures of the same planes, the lights carried around the shape, and one sheet of them\n"
     "  --zoom N           beside the planes, 1/N of the picture seen N times as large: its pixels, and rendered anew\n"
     "  --zoom-at X,Y      pixel in the middle of that (default the picture's)\n"
     "  --samples-per-pixel N    N x N rays a pixel in shaded pictures (default 1)\n"
@@ -37,7 +38,7 @@ enum { DEPTH = 1, NORMAL = 2, SILHOUETTE = 4, MASK = 8, COLOR = 16, DISTANCE = 3
 typedef struct job {
     const char *model, *code, *texture, *color_code, *out;
     view view;
-    int planes, frames, samples, zoom, zoom_at_given;
+    int planes, frames, relit, samples, zoom, zoom_at_given;
     float zoom_at[2];
     lighting lighting;
     int lit;
@@ -110,6 +111,9 @@ static job read_options(int argc, char **argv)
             j.texture = option_text(&o);
         } else if (option_is(&o, "--color-code")) {
             j.color_code = option_text(&o);
+        } else if (option_is(&o, "--relight")) {
+            j.relit = option_int(&o, 1, 3600);
+            j.lit = 1;
         } else if (option_is(&o, "--zoom")) {
             j.zoom = option_int(&o, 2, 1024);
         } else if (option_is(&o, "--zoom-at")) {
@@ -201,18 +205,27 @@ static canvas shade(dist_context *ctx, const dist_field *field, const job *j, co
     return picture_shaded(camera->width, camera->height, out->normal, out->mask, out->color);
 }
 
-/* The same from the field, of samples x samples rays a pixel; adds to stats and seconds. */
+/* Renders what shade needs, samples x samples rays a pixel; adds to stats and seconds. */
+static dist_images fine_planes(dist_context *ctx, const dist_field *field, const job *j, const dist_camera *fine,
+                               dist_stats *stats, double *seconds)
+{
+    dist_stats own;
+    dist_images out = planes_create(fine->width, fine->height, DISTANCE | NORMAL | (field->color_fn ? COLOR : 0), &own);
+    double start = seconds_now();
+    dist_render(ctx, field, fine, &j->how, &out, NULL);
+    *seconds += seconds_now() - start;
+    check(ctx);
+    add_stats(stats, &own);
+    out.stats = NULL;
+    return out;
+}
+
+/* The shaded or lit picture. */
 static canvas draw(dist_context *ctx, const dist_field *field, const job *j, const dist_camera *camera,
                    dist_stats *stats, double *seconds)
 {
     dist_camera fine = zoom_camera(camera, j->samples);
-    dist_stats own;
-    dist_images out = planes_create(fine.width, fine.height, DISTANCE | NORMAL | (field->color_fn ? COLOR : 0), &own);
-    double start = seconds_now();
-    dist_render(ctx, field, &fine, &j->how, &out, NULL);
-    *seconds += seconds_now() - start;
-    check(ctx);
-    add_stats(stats, &own);
+    dist_images out = fine_planes(ctx, field, j, &fine, stats, seconds);
     canvas picture = shade(ctx, field, j, &fine, &out);
     canvas_reduce(&picture, j->samples);
     planes_destroy(&out);
@@ -310,6 +323,50 @@ static void write_report(const job *j, dist_context *ctx, const dist_camera *cam
     printf("%s\n%llu queries, %llu hits, %.3f seconds\n", path, stats->queries, stats->hits, seconds);
 }
 
+/* STEM_000 and so on, then all of them on STEM_sheet. */
+static void write_frames(const job *j, int count, canvas *frames, const char *name)
+{
+    char number[32], stem[PATH_SIZE];
+    for (int i = 0; i < count; i++) {
+        snprintf(number, sizeof number, "_%s%03d", name, i);
+        write_picture(path_of(stem, j->out, number), frames[i].width, frames[i].height, frames[i].rgb);
+    }
+    int columns = (int)ceil(sqrt(1.5 * count));
+    canvas sheet = picture_sheet(count, frames, NULL, columns < count ? columns : count);
+    snprintf(number, sizeof number, "_%ssheet", name);
+    printf("%s\n", write_canvas(path_of(stem, j->out, number), &sheet));
+    for (int i = 0; i < count; i++) {
+        canvas_destroy(&frames[i]);
+    }
+    free(frames);
+}
+
+/* The planes are rendered once; only what the lights see is asked of the field again, and that for shadows alone. */
+static void relight(dist_context *ctx, const dist_field *field, const job *j, const dist_camera *camera,
+                    dist_stats *stats, double *seconds)
+{
+    dist_camera fine = zoom_camera(camera, j->samples);
+    dist_images out = fine_planes(ctx, field, j, &fine, stats, seconds);
+    canvas *frames = (canvas *)take((size_t)j->relit, sizeof *frames);
+    job turned = *j;
+    progress p = progress_begin("relighting");
+    for (int i = 0; i < j->relit; i++) {
+        float angle = 2.0f * PI * (float)i / (float)j->relit;
+        for (int k = 0; k < j->lighting.count; k++) {
+            const float *from = j->lighting.lights[k].toward;
+            float *to = turned.lighting.lights[k].toward;
+            to[0] = cosf(angle) * from[0] + sinf(angle) * from[2];
+            to[2] = cosf(angle) * from[2] - sinf(angle) * from[0];
+        }
+        frames[i] = shade(ctx, field, &turned, &fine, &out);
+        canvas_reduce(&frames[i], j->samples);
+        progress_show(&p, i + 1, j->relit, NULL, 0);
+    }
+    progress_end(&p);
+    planes_destroy(&out);
+    write_frames(j, j->relit, frames, "relit_");
+}
+
 /* One picture a turn's share, then all of them on one sheet. */
 static void turn(dist_context *ctx, const dist_field *field, const job *j)
 {
@@ -322,21 +379,10 @@ static void turn(dist_context *ctx, const dist_field *field, const job *j)
     for (int i = 0; i < j->frames; i++) {
         dist_camera turned = view_camera(&j->view, 2.0f * PI * (float)i / (float)j->frames);
         frames[i] = draw(ctx, field, j, &turned, &total, &seconds);
-        char number[16];
-        char stem[PATH_SIZE];
-        snprintf(number, sizeof number, "_%03d", i);
-        write_picture(path_of(stem, j->out, number), frames[i].width, frames[i].height, frames[i].rgb);
         progress_show(&p, i + 1, j->frames, NULL, 0);
     }
     progress_end(&p);
-    int columns = (int)ceil(sqrt(1.5 * j->frames));
-    canvas sheet = picture_sheet(j->frames, frames, NULL, columns < j->frames ? columns : j->frames);
-    char stem[PATH_SIZE];
-    printf("%s\n", write_canvas(path_of(stem, j->out, "_sheet"), &sheet));
-    for (int i = 0; i < j->frames; i++) {
-        canvas_destroy(&frames[i]);
-    }
-    free(frames);
+    write_frames(j, j->frames, frames, "");
     write_report(j, ctx, &camera, &total, seconds);
 }
 
@@ -358,6 +404,7 @@ static void render(dist_context *ctx, const dist_field *field, const job *j)
         write_plane(ctx, j, j->lit ? "lit" : "shaded", picture, 1, NULL);
     }
     planes_destroy(&out);
+    if (j->relit) { relight(ctx, field, j, &camera, &stats, &seconds); }
     if (j->zoom) { write_zoom(ctx, field, j, &camera, &stats, &seconds); }
     write_report(j, ctx, &camera, &stats, seconds);
 }

@@ -205,7 +205,8 @@ typedef struct dist_field {
                              float *d_points, double *d_code, float *d_weights);
     float center[3]; /* bounding sphere: the surface lies inside it, nothing is looked for outside */
     float radius;
-    float lipschitz; /* bound or estimate of |grad f|; 0: 1 */
+    float lipschitz;     /* bound or estimate of |grad f| where 0 < f < clamp / 2 (no clamp: radius / 20); 0: 1 */
+    float lipschitz_far; /* the same where f is larger; 0: lipschitz */
     float clamp;     /* |f| above this carries no distance (a clamped training); 0: none */
     int kinks;       /* 1: grad f jumps (ReLU), which second_fn leaves out: a normal's gradient is by differences */
     int code_size;   /* length of d_code */
@@ -442,7 +443,7 @@ enum {
 };
 
 typedef struct dist_render_desc {
-    int max_steps;       /* queries per ray at most; 0: 100 guarded, 50 paper */
+    int max_steps;       /* queries per ray at most; 0: 100 guarded, 1000 certified, 50 paper */
     float step_scale;    /* alpha; 0: 1.5 (paper: rows aggressive and coarse-to-fine). Above 0 */
     float epsilon; /* largest |f| of a hit, shape units; 0: 5e-5, or less where a pixel is smaller (see the README) */
     int samples;         /* K of the paper's gradient, 1 to 8; 0: 1 */
@@ -462,6 +463,7 @@ typedef struct dist_render_desc {
                          without a mask; 0: off */
     int no_cones;        /* 1: every ray marches from the bounding sphere by itself */
     int no_prediction;   /* 1: no ray starts from what its neighbors found */
+    int certified;       /* 1: only steps that the Lipschitz figures prove; nothing is missed where these are bounds */
     /* dist_trace only. any_hit 1: a ray ends as soon as anything is certain to block it, for shadows; its distance is
        then that of a sample inside what blocks, its error how far before that it goes in. max_distance: how far a ray
        looks, in lengths of its direction (1: from origin to origin + direction); 0: without end */
@@ -873,7 +875,7 @@ struct dist_context {
 /* Each worker's scratch: counters, then the tracer's part, then the field's. */
 enum {
     DISTI_COUNTER_BYTES = 64,
-    DISTI_TRACE_BYTES = 832 * 1024,
+    DISTI_TRACE_BYTES = 1280 * 1024,
     DISTI_FIELD_OFFSET = DISTI_COUNTER_BYTES + DISTI_TRACE_BYTES
 };
 /* Sums that must not depend on the number of threads are kept in this many slots. */
@@ -2354,6 +2356,9 @@ static dist_status disti_field_check(dist_context *ctx, const dist_field *field,
     if (!disti_finite(field->lipschitz) || field->lipschitz < 0.0f)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.lipschitz is %d, must be 0 or positive", function,
                           (double)field->lipschitz, 0);
+    if (!disti_finite(field->lipschitz_far) || field->lipschitz_far < 0.0f)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.lipschitz_far is %d, must be 0 or positive", function,
+                          (double)field->lipschitz_far, 0);
     if (!disti_finite(field->clamp) || field->clamp < 0.0f)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.clamp is %d, must be 0 or positive", function,
                           (double)field->clamp, 0);
@@ -2810,6 +2815,19 @@ DIST_API dist_status dist_field_eikonal(dist_context *ctx, const dist_field *fie
     return status;
 }
 #endif
+
+/* |f| from which on lipschitz_far holds: a clamped training leaves slopes of no meaning beyond. */
+static float disti_far_from(const dist_field *field)
+{
+    return field->clamp > 0.0f ? 0.5f * field->clamp : 0.05f * field->radius;
+}
+
+/* The larger of a field's two figures. */
+static float disti_steepest(const dist_field *field)
+{
+    float near = field->lipschitz > 0.0f ? field->lipschitz : 1.0f;
+    return DISTI_MAX(near, field->lipschitz_far);
+}
 
 /* Scenes. An instance's field lives in its bounding sphere (center c, radius r), q is p in the shape's space,
    d = |q - c| - r, m = r / 5. What is asked of it stays within the sphere; outside it goes on as a lower bound of the
@@ -3429,6 +3447,7 @@ DIST_API dist_field dist_scene_field(dist_scene *scene)
         const dist_field *f = &scene->placed[k].field;
         float clamp = f->clamp * scene->placed[k].scale;
         field.lipschitz = DISTI_MAX(field.lipschitz, f->lipschitz);
+        field.lipschitz_far = DISTI_MAX(field.lipschitz_far, disti_steepest(f));
         if (clamp > 0.0f && !(field.clamp > 0.0f && field.clamp < clamp)) field.clamp = clamp;
         if (!f->color_fn) field.color_fn = NULL;
         if (!f->color_adjoint_fn) field.color_adjoint_fn = NULL;
@@ -4339,7 +4358,7 @@ struct dist_shape {
     const dist_net *net;
     float *code;
     float *bias; /* (layers + 1, max_rows): each layer's bias with the code folded in; then zeros, for tangents */
-    float lipschitz;
+    float lipschitz, lipschitz_far;
     dist_shape *texture; /* the net that colors it, with [code, color code] folded in; NULL: none */
     float *store; /* activations and deltas of store_blocks blocks, for weight gradients */
     size_t store_block_size;
@@ -5324,42 +5343,56 @@ static void disti_shape_color_weights_fn(void *user, dist_context *ctx, size_t n
 }
 #endif
 
-/* Sampled |grad f| in the bounding sphere: the 90th percentile of 768 points, at least 1: what matters is not the
-   steepest spot but how far f exceeds the distance, which is its mean slope on the way. The points are those of a
-   fixed low-discrepancy sequence (the plastic number's). */
-static float disti_shape_slope(dist_shape *shape, const dist_field *field)
+/* Sampled |grad f| outside the surface: the 4/5 quantile near it, 31/32 beyond disti_far_from, at least 1. What matters
+   is not the steepest spot but how far f exceeds the distance, which is its mean slope on the way. Half of the 768
+   points are those of a fixed low-discrepancy sequence (the plastic number's) in the bounding sphere, half are these
+   moved along their gradients to a place near the surface. */
+static void disti_shape_slope(dist_shape *shape, const dist_field *field)
 {
-    enum { SAMPLES = 768, BINS = 256 };
-    int bins[BINS];
-    float points[3 * DISTI_BLOCK], sdf[DISTI_BLOCK], gradient[3 * DISTI_BLOCK];
-    memset(bins, 0, sizeof bins);
+    enum { ROUNDS = 16, BINS = 256 };
+    static const double step[3] = {0.8191725133961645, 0.6710436067037893, 0.5497004779019703};
+    int bins[2][BINS], count[2] = {0, 0};
+    float points[3 * DISTI_BLOCK], sdf[DISTI_BLOCK], gradient[3 * DISTI_BLOCK], slopes[2];
+    float beyond = disti_far_from(field);
     double u[3] = {0.5, 0.5, 0.5};
-    for (int i = 0; i < SAMPLES; i += DISTI_BLOCK) {
+    memset(bins, 0, sizeof bins);
+    for (int round = 0; round < ROUNDS; round++) {
         for (int j = 0; j < DISTI_BLOCK;) {
-            static const double step[3] = {0.8191725133961645, 0.6710436067037893, 0.5497004779019703};
+            float *p = points + 3 * j, *g = gradient + 3 * j;
             double length = 0.0;
             for (int k = 0; k < 3; k++) {
                 u[k] += step[k];
                 if (u[k] >= 1.0) u[k] -= 1.0;
                 length += (2.0 * u[k] - 1.0) * (2.0 * u[k] - 1.0);
             }
-            if (length > 1.0) continue;
-            for (int k = 0; k < 3; k++) points[3 * j + k] = field->radius * (float)(2.0 * u[k] - 1.0);
-            j++;
+            if (round & 1) {
+                float square = g[0] * g[0] + g[1] * g[1] + g[2] * g[2];
+                float move = square > 1e-2f ? (beyond * (float)u[0] - sdf[j]) / square : 0.0f;
+                for (int k = 0; k < 3; k++) p[k] += move * g[k];
+            } else {
+                for (int k = 0; k < 3; k++) p[k] = field->radius * (float)(2.0 * u[k] - 1.0);
+            }
+            j += round & 1 || length <= 1.0;
         }
         unsigned state = disti_float_state_enter();
         field->eval_fn(shape, 0, DISTI_BLOCK, points, sdf, gradient);
         disti_float_state_leave(state);
         for (int j = 0; j < DISTI_BLOCK; j++) {
-            float slope = disti_length(gradient[3 * j], gradient[3 * j + 1], gradient[3 * j + 2]);
-            int bin = disti_finite(slope) && slope < 8.0f ? (int)(slope * 32.0f) : BINS - 1;
-            bins[bin < BINS ? bin : BINS - 1]++;
+            const float *p = points + 3 * j, *g = gradient + 3 * j;
+            float slope = disti_length(g[0], g[1], g[2]);
+            int bin = disti_finite(slope) && slope < 7.9f ? (int)(slope * 32.0f) : BINS - 1, far = sdf[j] > beyond;
+            if (!(sdf[j] > 0.0f) || !(disti_length(p[0], p[1], p[2]) <= field->radius)) continue;
+            bins[far][bin]++;
+            count[far]++;
         }
     }
-    int above = 0, bin = BINS - 1;
-    while (bin > 0 && above + bins[bin] <= SAMPLES / 10) above += bins[bin--];
-    float slope = (float)(bin + 1) / 32.0f;
-    return slope > 1.0f ? slope : 1.0f;
+    for (int far = 0; far < 2; far++) {
+        int above = 0, bin = BINS - 1;
+        while (bin > 0 && above + bins[far][bin] <= count[far] / (far ? 32 : 5)) above += bins[far][bin--];
+        slopes[far] = count[far] > 0 ? DISTI_MAX(1.0f, (float)(bin + 1) / 32.0f) : 1.0f;
+    }
+    shape->lipschitz = slopes[0];
+    shape->lipschitz_far = slopes[1];
 }
 
 DIST_API dist_field dist_shape_field(dist_shape *shape)
@@ -5397,6 +5430,7 @@ DIST_API dist_field dist_shape_field(dist_shape *shape)
     if (shape->texture) field.color_code_size = shape->texture->net->code_size - net->code_size;
     field.radius = net->bound;
     field.lipschitz = shape->lipschitz;
+    field.lipschitz_far = shape->lipschitz_far;
     field.clamp = net->clamp;
     field.kinks = net->activation == DIST_ACTIVATION_RELU;
     field.code_size = net->code_size;
@@ -5500,10 +5534,10 @@ DIST_API dist_shape *dist_shape_create(dist_context *ctx, const dist_net *net, c
     }
 #endif
     if (dist_shape_set_code(shape, code) != DIST_OK) goto fail;
-    shape->lipschitz = 1.0f;
+    shape->lipschitz = shape->lipschitz_far = 1.0f;
     if (net->sdf_channel >= 0) {
         dist_field field = dist_shape_field(shape);
-        shape->lipschitz = disti_shape_slope(shape, &field);
+        disti_shape_slope(shape, &field);
     }
     return shape;
 fail:
@@ -6598,6 +6632,9 @@ typedef struct disti_ray {
     unsigned char known; /* marching: the slope is measured */
     unsigned char side;  /* bracket, band: queries in it so far; marching: steps since a sample beyond was negative */
     unsigned char moved; /* band: 1 if the ray came into it from outside */
+    unsigned char aim;   /* 1: the neighbors predict the hit at target, 2: but not how f falls there */
+    float target, incline; /* s, df/ds there */
+    float off;             /* of a hit: how far the neighbors' prediction was from it; 0: there was none */
 } disti_ray;
 
 enum {
@@ -6619,6 +6656,7 @@ typedef struct disti_tracer {
     const dist_field *field;
     dist_render_desc how;
     float lipschitz, epsilon, noise;
+    float far, ratio; /* from |f| = far on the slope is at most lipschitz / ratio */
 } disti_tracer;
 
 DIST_API dist_render_desc dist_render_desc_resolve(const dist_render_desc *desc)
@@ -6626,7 +6664,7 @@ DIST_API dist_render_desc dist_render_desc_resolve(const dist_render_desc *desc)
     dist_render_desc how;
     memset(&how, 0, sizeof how);
     if (desc) how = *desc;
-    if (how.max_steps == 0) how.max_steps = how.trace == DIST_TRACE_PAPER ? 50 : 100;
+    if (how.max_steps == 0) how.max_steps = how.trace == DIST_TRACE_PAPER ? 50 : how.certified ? 1000 : 100;
     if (how.step_scale == 0.0f) how.step_scale = 1.5f;
     if (how.epsilon == 0.0f && how.trace == DIST_TRACE_PAPER) how.epsilon = 5e-5f;
     if (how.samples == 0) how.samples = 1;
@@ -6665,6 +6703,7 @@ static dist_status disti_how_check(dist_context *ctx, const dist_render_desc *ho
     if ((status = disti_choice(ctx, function, "inside", how->inside, DIST_INSIDE_EXIT)) != DIST_OK) return status;
     if ((status = disti_choice(ctx, function, "no_cones", how->no_cones, 1)) != DIST_OK) return status;
     if ((status = disti_choice(ctx, function, "no_prediction", how->no_prediction, 1)) != DIST_OK) return status;
+    if ((status = disti_choice(ctx, function, "certified", how->certified, 1)) != DIST_OK) return status;
     if ((status = disti_choice(ctx, function, "any_hit", how->any_hit, 1)) != DIST_OK) return status;
     if (!disti_finite(how->max_distance) || how->max_distance < 0.0f)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.max_distance is %d, must be 0 or positive", function,
@@ -6723,9 +6762,20 @@ static dist_status disti_tracer_init(disti_tracer *tracer, dist_context *ctx, co
     tracer->lipschitz = tracer->how.lipschitz > 0.0f ? tracer->how.lipschitz
                         : field->lipschitz > 0.0f    ? field->lipschitz
                                                      : 1.0f;
+    tracer->far = disti_far_from(field);
+    tracer->ratio = 1.0f;
+    if (!(tracer->how.lipschitz > 0.0f) && field->lipschitz_far > 0.0f)
+        tracer->ratio = tracer->lipschitz / field->lipschitz_far;
     tracer->noise = 5e-7f * field->radius;
     tracer->epsilon = DISTI_MAX(tracer->how.epsilon, tracer->how.epsilon > 0.0f ? tracer->noise : 0.0f);
     return DIST_OK;
+}
+
+/* Radius of the sphere around a point with this |f| in which the Lipschitz figures allow no surface. */
+static float disti_empty(const disti_tracer *tracer, float f)
+{
+    float beyond = f - tracer->far;
+    return (beyond > 0.0f ? tracer->far + beyond * tracer->ratio : f) / tracer->lipschitz;
 }
 
 /* center and direction (unit) of the ray in the field's space. The closest approach is found in double: a float's
@@ -6837,7 +6887,7 @@ static int disti_ray_bracketed(const disti_tracer *tracer, disti_ray *ray, float
     float flatter = DISTI_MIN(slope, other > 0.0f ? other : -other);
     if (slope > 1e-3f && magnitude <= tolerance * DISTI_MIN(0.5f * slope, flatter)) {
         ray->slope = -slope;
-        return disti_ray_end(ray, DIST_RAY_HIT, ray->q + f / slope, 0.0f, magnitude / flatter); /* one secant more */
+        return disti_ray_end(ray, DIST_RAY_HIT, ray->q + f / slope, 0.0f, (magnitude + tracer->noise) / flatter);
     }
     if (inside) {
         ray->b = ray->q;
@@ -6860,20 +6910,24 @@ static int disti_ray_open_bracket(const disti_tracer *tracer, disti_ray *ray, fl
     return disti_ray_bracket(tracer, ray);
 }
 
-/* Steps no shorter than this are taken along a surface that the ray hardly approaches. They grow from the 20th query
-   on, so that a plateau of f ends within the budget. */
+/* Steps no shorter than this are taken along a surface that the ray hardly approaches: half a pixel, so that what a
+   chord cuts off is a small part of one. They grow from the 20th query on, so that a plateau of f ends within the
+   budget. */
 static float disti_ray_floor(const disti_tracer *tracer, const disti_ray *ray)
 {
+    if (tracer->how.certified) return 0.0f;
     float patience = ray->steps > 20 ? 1.0f + 0.1f * (float)(ray->steps - 20) : 1.0f;
-    return 5e-4f * patience * tracer->field->radius;
+    float pixel = (float)(ray->base + (double)ray->s) * ray->footprint, radius = tracer->field->radius;
+    return patience * DISTI_MAX(5e-4f * radius, DISTI_MIN(pixel, 3e-3f * radius));
 }
 
 /* Where to look next from the front: near the surface a jump to where the last slope says that f ends, at most three
-   spheres far; else a sphere step, stretched by what the slope allows: for a plane that recedes or comes at the
-   angle seen, 2 / (1 - slope) (auto-relaxation). What is found there is checked on arrival. */
+   spheres or a hundredth of the radius far; else a sphere step, stretched by what the slope allows: for a
+   plane that recedes or comes at the angle seen, 2 / (1 - slope) (auto-relaxation). What is found there is checked on
+   arrival. */
 static int disti_ray_step(const disti_tracer *tracer, disti_ray *ray)
 {
-    float radius = ray->f / tracer->lipschitz;
+    float radius = disti_empty(tracer, ray->f);
     float epsilon = disti_ray_epsilon(tracer, ray, ray->s);
     float slope = ray->slope / tracer->lipschitz;
     if (ray->fb < 0.0f && ray->s + radius >= ray->b) /* not Lipschitz after all */
@@ -6884,8 +6938,12 @@ static int disti_ray_step(const disti_tracer *tracer, disti_ray *ray)
     float step = radius * DISTI_MIN(stretch, 8.0f);
     int mode = DISTI_MARCH;
     if (ray->known && slope < -0.05f && ray->f < 0.05f * tracer->field->radius) {
-        float jump = 1.03f * ray->f / -ray->slope + 0.5f * epsilon;
-        step = DISTI_MIN(jump, 3.0f * radius + epsilon);
+        float jump = ray->f / -ray->slope, cap = 3.0f * radius + epsilon;
+        step = 1.03f * jump + 0.5f * epsilon;
+        if (step > cap) { /* short of the end: f must still be positive there, or something came in between */
+            if (ray->f < 5e-3f * tracer->field->radius) cap = DISTI_MAX(cap, 1e-2f * tracer->field->radius);
+            step = DISTI_MIN(0.97f * jump, cap);
+        }
         mode = DISTI_JUMP;
     }
     if (ray->known && slope > -0.3f) { /* but not through a surface that the slope foretells */
@@ -6904,7 +6962,7 @@ static int disti_ray_step(const disti_tracer *tracer, disti_ray *ray)
 static int disti_ray_trusts(const disti_tracer *tracer, const disti_ray *ray, float f, float step)
 {
     float expected = ray->f + ray->slope * step;
-    if (!ray->known) return 0;
+    if (!ray->known || tracer->how.certified) return 0;
     int creeps = ray->slope > -0.3f * tracer->lipschitz && step <= 1.001f * disti_ray_floor(tracer, ray);
     if (creeps && expected > 0.0f) return 1;
     float off = f - expected;
@@ -6974,23 +7032,48 @@ static int disti_ray_inside(const disti_tracer *tracer, disti_ray *ray, float f)
     return disti_ray_step(tracer, ray);
 }
 
+/* Off to where the neighbors predict the hit, if f at the front is no smaller than the predicted surface alone would
+   make it: else something nearer is about. */
+static int disti_ray_aims(const disti_tracer *tracer, const disti_ray *ray, float f)
+{
+    float far = -ray->incline * (ray->target - ray->s);
+    return ray->aim && far > 0.0f && far <= f + 1e-3f * tracer->field->radius && !(ray->fb < 0.0f);
+}
+
+static int disti_ray_aim(disti_ray *ray)
+{
+    ray->side = ray->aim == 2;
+    ray->aim = 0;
+    ray->fa = 3e38f;
+    return disti_ray_ask(ray, DISTI_PREDICT, ray->target);
+}
+
 /* A sample where the neighbors' hits and slopes predicted this ray's: Newton's steps, the first by their slope, the
-   others by its own. A step too long to trust, or f that does not shrink, sends the ray to march from where the cones
-   left it. */ static int disti_ray_predicted(const disti_tracer *tracer, disti_ray *ray, float f)
+   others by its own. A step too long to trust, or f that does not shrink, sends the ray back to its front. */
+static int disti_ray_predicted(const disti_tracer *tracer, disti_ray *ray, float f)
 {
     float epsilon = disti_ray_epsilon(tracer, ray, ray->q);
-    float slope = ray->side == 0 ? ray->slope : (f - ray->fa) / (ray->q - ray->a);
+    int first = ray->fa > 2e38f, fronted = ray->f > 0.0f;
+    int trusted = first && ray->side == 0 && ray->incline < -0.3f * tracer->lipschitz;
+    float slope = first ? ray->incline : (f - ray->fa) / (ray->q - ray->a);
     float step = -f / slope, length = step < 0.0f ? -step : step;
     float magnitude = f < 0.0f ? -f : f, before = ray->fa < 0.0f ? -ray->fa : ray->fa;
-    int good = slope < -0.12f * tracer->lipschitz && length < 0.03f * tracer->field->radius &&
-               (ray->side == 0 || magnitude < before) && ray->side < 4;
-    if (good && length <= (ray->side == 0 ? 4.0f : 12.0f) * epsilon) {
-        float s = ray->q + step;
+    int good = slope < -0.12f * tracer->lipschitz && length < 0.03f * tracer->field->radius && magnitude < before &&
+               ray->side < 5;
+    if (good && (trusted || !first) && length <= (trusted ? 4.0f : 12.0f) * epsilon) {
+        float off = ray->q + step - ray->target;
         ray->slope = slope;
-        return disti_ray_end(ray, DIST_RAY_HIT, s, f, length);
+        ray->off = DISTI_MAX(off < 0.0f ? -off : off, 1e-9f);
+        return disti_ray_end(ray, DIST_RAY_HIT, ray->q + step, f, 2.0f * length - tracer->noise / slope);
     }
-    if (!good || ray->q + step <= ray->start || ray->q + step >= ray->leave)
-        return disti_ray_ask(ray, DISTI_FIRST, ray->start);
+    if (!good || ray->q + step <= (fronted ? ray->s : ray->start) || ray->q + step >= ray->leave) {
+        if (f < 0.0f && !(ray->fb < 0.0f)) {
+            ray->b = ray->q;
+            ray->fb = f;
+        }
+        ray->side = 0;
+        return fronted ? disti_ray_step(tracer, ray) : disti_ray_ask(ray, DISTI_FIRST, ray->start);
+    }
     ray->a = ray->q;
     ray->fa = f;
     ray->side++;
@@ -7044,13 +7127,16 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
     case DISTI_SKIP:
     case DISTI_MARCH:
     case DISTI_JUMP: {
-        float radius = ray->f / tracer->lipschitz, step = q - ray->s;
+        float radius = disti_empty(tracer, ray->f), step = q - ray->s;
         float spacing = 4.8e-7f * tracer->field->radius;
-        if (ray->fb < 0.0f && f > 0.0f && q < ray->b && ++ray->side >= 3)
+        if (ray->fb < 0.0f && f > 0.0f && q < ray->b && ++ray->side >= 3 && !tracer->how.certified)
             return disti_ray_open_bracket(tracer, ray, q, f, ray->b, ray->fb);
-        float gap = step - radius - (f < 0.0f ? -f : f) / tracer->lipschitz; /* what neither sphere covers */
+        float gap = step - radius - disti_empty(tracer, f < 0.0f ? -f : f); /* what neither sphere covers */
         int back = ray->mode != DISTI_SKIP && step > 1.0001f * radius + spacing;
-        if (f <= 0.0f && !(back && gap > 1e-3f * tracer->field->radius))
+        float off = f - (ray->f + ray->slope * step);
+        int foretold = ray->known && (off < 0.0f ? -off : off) < 0.5f * (off - f); /* as deep as expected */
+        float room = tracer->how.certified ? 0.0f : (foretold ? 2e-2f : 1e-3f) * tracer->field->radius;
+        if (f <= 0.0f && !(back && gap > room))
             return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, q, f);
         if (back && (f <= 0.0f || (gap > 0.0f && !disti_ray_trusts(tracer, ray, f, step)))) {
             float slope = (f - ray->f) / step; /* something may hide in the gap: back, and keep the far sample */
@@ -7066,14 +7152,15 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
         if (ray->fb < 0.0f) { /* a crossing lies before b: is there room for another before it? */
             float left = ray->b - q - (f - ray->fb) / tracer->lipschitz;
             if (ray->b <= q) return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->b, ray->fb);
-            if (left <= 1e-3f * tracer->field->radius)
+            if (left <= (tracer->how.certified ? spacing : 1e-3f * tracer->field->radius))
                 return disti_ray_open_bracket(tracer, ray, q, f, ray->b, ray->fb);
         }
         ray->slope = (f - ray->f) / step;
         ray->s = q;
         ray->f = f;
         ray->known = 1;
-        if (ray->fb > 0.0f && ray->b > q && ray->b - q <= (f + ray->fb) / tracer->lipschitz) { /* the gap is closed */
+        if (ray->fb > 0.0f && ray->b > q &&
+            ray->b - q <= disti_empty(tracer, f) + disti_empty(tracer, ray->fb)) { /* the gap is closed */
             ray->slope = (ray->fb - f) / (ray->b - q);
             ray->s = ray->b;
             ray->f = ray->fb;
@@ -7092,19 +7179,27 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
         return disti_ray_feel(tracer, ray, disti_ray_epsilon(tracer, ray, ray->s));
     }
     if (ray->s >= ray->leave) return disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest * ray->sign, 0.0f);
-    return disti_ray_step(tracer, ray);
+    return disti_ray_aims(tracer, ray, ray->f) ? disti_ray_aim(ray) : disti_ray_step(tracer, ray);
 }
 
 /* A worker's share of the tracer's memory. */
 enum { DISTI_TILE = 64, DISTI_TILE_RAYS = (DISTI_TILE + 1) * (DISTI_TILE + 1) };
 
-/* Spheres that samples of the tile's rays prove empty, radius f / L, kept for each block of 16 x 16 pixels: a later
-   ray of the block skips what they cover. The oldest makes room for the newest. */
-enum { DISTI_BALL_BLOCK = 16, DISTI_BALLS = 48, DISTI_BALL_LISTS = 5 * 5 };
+/* Spheres that samples of the tile's rays prove empty, and the parts of each ray that those of the rays around it
+   cover. A ray that is about to step skips what is covered. Pool full: no more are kept. */
+enum { DISTI_POOL = 8192, DISTI_COVERS = 8 };
+
+typedef struct disti_cover {
+    float from[DISTI_COVERS], to[DISTI_COVERS]; /* disjoint, in no order; to = -3e38: free */
+    int seen;                                   /* balls up to this one are in it */
+} disti_cover;
 
 typedef struct disti_balls {
-    int count[DISTI_BALL_LISTS];
-    float ball[DISTI_BALL_LISTS][DISTI_BALLS][4]; /* center, radius */
+    int count, window;          /* window: pixels around a ray whose balls it looks at */
+    int head[DISTI_TILE_RAYS];  /* a pixel's newest ball; 0: none */
+    int next[DISTI_POOL];       /* the same pixel's next older one */
+    float ball[DISTI_POOL][4];  /* center, radius */
+    disti_cover cover[DISTI_TILE_RAYS];
 } disti_balls;
 
 /* A task's share of how.max_queries. Each hit owes per_hit queries for its normal and color, so while marching a query
@@ -7123,10 +7218,11 @@ typedef struct disti_bench { /* the work bench of one task */
     int *index;        /* DISTI_TILE_RAYS */
     unsigned char *rest; /* what else a task wants: DISTI_REST_BYTES */
     disti_balls *balls;  /* NULL: rays do not share */
-    int width, publish;  /* of the tile; whether samples become balls */
+    int width, height;   /* of the tile */
+    float least;         /* smallest ball worth keeping */
 } disti_bench;
 
-enum { DISTI_REST_BYTES = 128 * 1024 };
+enum { DISTI_REST_BYTES = 480 * 1024 };
 
 static void disti_bench_init(const dist_context *ctx, int worker, disti_bench *bench)
 {
@@ -7140,7 +7236,8 @@ static void disti_bench_init(const dist_context *ctx, int worker, disti_bench *b
     bench->rest = (unsigned char *)disti_take(base, &at, DISTI_REST_BYTES, 1);
     bench->balls = NULL;
     bench->budget = NULL;
-    bench->width = bench->publish = 0;
+    bench->width = bench->height = 0;
+    bench->least = 0.0f;
     DIST_ASSERT(at <= DISTI_TRACE_BYTES);
 }
 
@@ -7172,42 +7269,62 @@ static void disti_ray_point(const disti_ray *ray, float s, float p[3])
     for (int i = 0; i < 3; i++) p[i] = ray->origin[i] + s * ray->direction[i];
 }
 
-static int disti_ball_list(const disti_bench *bench, int index)
-{
-    int x = index % bench->width / DISTI_BALL_BLOCK, y = index / bench->width / DISTI_BALL_BLOCK;
-    return 5 * y + x;
-}
-
 static void disti_publish(const disti_tracer *tracer, const disti_bench *bench, int index, const float *p, float f)
 {
-    float radius = f / tracer->lipschitz;
-    if (!(radius > 4e-3f * tracer->field->radius)) return;
-    int list = disti_ball_list(bench, index);
-    float *ball = bench->balls->ball[list][bench->balls->count[list]++ % DISTI_BALLS];
+    disti_balls *balls = bench->balls;
+    float radius = disti_empty(tracer, f);
+    if (!(radius > bench->least) || balls->count + 1 >= DISTI_POOL) return;
+    float *ball = balls->ball[++balls->count];
     memcpy(ball, p, 3 * sizeof(float));
     ball[3] = radius;
+    balls->next[balls->count] = balls->head[index];
+    balls->head[index] = balls->count;
 }
 
-/* How far along the ray the balls cover it without a gap, from s on. */
+/* Adds [from, to] to what is covered; where all places are taken the farthest part gives way. */
+static void disti_cover_add(disti_cover *cover, float from, float to)
+{
+    int free = -1, farthest = 0;
+    for (int i = 0; i < DISTI_COVERS; i++) {
+        if (cover->to[i] >= from && cover->from[i] <= to) { /* they meet: one */
+            from = DISTI_MIN(from, cover->from[i]);
+            to = DISTI_MAX(to, cover->to[i]);
+            cover->to[i] = -3e38f;
+        }
+        if (cover->to[i] < -1e38f) free = i;
+        else if (cover->from[i] > cover->from[farthest]) farthest = i;
+    }
+    if (free < 0 && cover->from[farthest] <= from) return;
+    if (free < 0) free = farthest;
+    cover->from[free] = from;
+    cover->to[free] = to;
+}
+
+/* How far along the ray the balls around it cover it without a gap, from s on. */
 static float disti_covered(const disti_bench *bench, int index, const disti_ray *ray, float s)
 {
-    int list = disti_ball_list(bench, index);
-    int count = DISTI_MIN(bench->balls->count[list], (int)DISTI_BALLS);
-    for (int pass = 0, moved = 1; pass < 3 && moved; pass++) {
-        moved = 0;
-        for (int i = 0; i < count; i++) {
-            const float *ball = bench->balls->ball[list][i];
-            float d[3] = {ball[0] - ray->origin[0], ball[1] - ray->origin[1], ball[2] - ray->origin[2]};
-            float along = d[0] * ray->direction[0] + d[1] * ray->direction[1] + d[2] * ray->direction[2];
-            float half = ball[3] * ball[3] - (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] - along * along);
-            float from = s - along;
-            if (!(half > from * from)) continue; /* s is not within the ball */
-            float end = along + sqrtf(half);
-            if (end <= s + 1e-6f) continue;
-            s = end;
-            moved = 1;
+    disti_balls *balls = bench->balls;
+    disti_cover *cover = &balls->cover[index];
+    int x = index % bench->width, y = index / bench->width, window = balls->window;
+    int x0 = DISTI_MAX(x - window, 0), x1 = DISTI_MIN(x + window, bench->width - 1);
+    int y0 = DISTI_MAX(y - window, 0), y1 = DISTI_MIN(y + window, bench->height - 1);
+    for (y = y0; y <= y1; y++) {
+        const int *head = balls->head + y * bench->width;
+        for (x = x0; x <= x1; x++) {
+            for (int i = head[x]; i > cover->seen; i = balls->next[i]) {
+                const float *ball = balls->ball[i];
+                float d[3] = {ball[0] - ray->origin[0], ball[1] - ray->origin[1], ball[2] - ray->origin[2]};
+                float along = d[0] * ray->direction[0] + d[1] * ray->direction[1] + d[2] * ray->direction[2];
+                float half = ball[3] * ball[3] - (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] - along * along);
+                if (!(half > 0.0f)) continue;
+                half = sqrtf(half);
+                if (along + half > s) disti_cover_add(cover, along - half, along + half);
+            }
         }
     }
+    cover->seen = balls->count;
+    for (int i = 0; i < DISTI_COVERS; i++)
+        if (s >= cover->from[i] && s < cover->to[i]) return cover->to[i];
     return s;
 }
 
@@ -7250,7 +7367,7 @@ static void disti_trace_rounds(const disti_tracer *tracer, int worker, const dis
             disti_ray *ray = &bench->rays[bench->index[i]];
             if (ray->mode >= DISTI_BAND) bench->stats->refine_queries++;
             else bench->stats->march_queries++;
-            if (bench->publish) disti_publish(tracer, bench, bench->index[i], bench->points + 3 * i, bench->sdf[i]);
+            if (bench->balls) disti_publish(tracer, bench, bench->index[i], bench->points + 3 * i, bench->sdf[i]);
             if (disti_ray_advance(tracer, ray, bench->sdf[i])) bench->index[kept++] = bench->index[i];
             else if (bench->budget) bench->budget->hits += (unsigned)disti_ray_is_hit(tracer, ray);
         }
@@ -7668,8 +7785,8 @@ static int disti_cone_advance(const disti_tracer *tracer, disti_cone *cone, floa
     cone->blocked = 1;
     cone->f = f;
     if (!disti_finite(f)) return 0;
-    double radius = ((double)f - (double)(tracer->epsilon > 0.0f ? tracer->epsilon : 5e-5f * tracer->field->radius)) /
-                    (double)tracer->lipschitz;
+    float margin = tracer->epsilon > 0.0f ? tracer->epsilon : 5e-5f * tracer->field->radius;
+    double radius = (double)disti_empty(tracer, f - margin);
     double wide = cone->t * cone->sine;
     if (radius < 1.05 * cone->t * cone->chord || radius <= wide) return 0;
     double t = cone->t * cone->cosine + sqrt(radius * radius - wide * wide);
@@ -7785,62 +7902,106 @@ static void disti_cones(const disti_tracer *tracer, int worker, const disti_tile
    smaller than the predicted surface alone would make it, or something else is near. */
 enum { DISTI_LATTICE = 8 };
 
-/* Prediction along one axis of the picture: neighbors at -h and h, and -3 h and 3 h if they are in the tile.
-   Returns 0 if they do not allow one. */
-static int disti_predict_axis(const disti_tracer *tracer, const disti_ray *ray, int at, int end, int h, int stride,
-                              float *depth, float *slope)
+/* z of a hit k h pixels along one axis; 0 where there is none. */
+static float disti_hit_depth(const disti_ray *ray, int at, int end, int shift, int stride)
 {
-    float z[4];
-    float near = 0.1f * tracer->field->radius;
-    if (at - h < 0 || at + h >= end) return 0;
-    for (int k = 1; k <= 2; k++) {
-        const disti_ray *other = ray + (2 * k - 3) * h * stride;
-        if (other->status != DIST_RAY_HIT || other->mode != DISTI_DONE) return 0;
-        z[k] = (float)(other->base + (double)other->best) * other->cosine;
-        *slope += 0.5f * other->slope;
-    }
-    float steeper = DISTI_MIN(ray[-h * stride].slope, ray[h * stride].slope);
-    float flatter = DISTI_MAX(ray[-h * stride].slope, ray[h * stride].slope);
-    if (flatter > 0.4f * steeper) return 0; /* f does not fall alike at both: the slope here is anyone's guess */
-    float gap = z[1] - z[2];
-    if (gap > near || gap < -near || !(z[1] > 0.0f) || !(z[2] > 0.0f)) return 0;
-    float inverse = 0.5f * (1.0f / z[1] + 1.0f / z[2]);
-    if (at - 3 * h >= 0 && at + 3 * h < end) {
-        const disti_ray *left = ray - 3 * h * stride, *right = ray + 3 * h * stride;
-        float a = (float)(left->base + (double)left->best) * left->cosine;
-        float b = (float)(right->base + (double)right->best) * right->cosine;
-        int known = left->status == DIST_RAY_HIT && right->status == DIST_RAY_HIT && left->mode == DISTI_DONE &&
-                    right->mode == DISTI_DONE;
-        float off_a = a - z[1], off_b = b - z[2];
-        if (known && off_a * off_a < near * near && off_b * off_b < near * near && a > 0.0f && b > 0.0f)
-            inverse = (9.0f / z[1] + 9.0f / z[2] - 1.0f / a - 1.0f / b) * 0.0625f;
-    }
-    *depth = 1.0f / inverse;
-    return 1;
+    const disti_ray *other = ray + shift * stride;
+    if (at + shift < 0 || at + shift >= end || other->status != DIST_RAY_HIT || other->mode != DISTI_DONE) return 0.0f;
+    return (float)(other->base + (double)other->best) * other->cosine;
 }
 
-/* Sets up pixel (x, y) for its first query, half way between pixels at distance h known along x, y or both. */
-static void disti_predict(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench, int x, int y,
+typedef struct disti_guess {
+    float depth, slope;
+    int quality; /* 3: by four hits alike, 2: good, 1: but the slope is anyone's guess, -1: beyond an edge, 0: none */
+    float off;   /* how far the prediction was from the neighbors; 0: unknown */
+} disti_guess;
+
+/* Prediction along one axis of the picture from the hits at -3 h, -h, h, 3 h. Across an edge, where the hits at -h and
+   h are a step apart, it is the farther surface, in case that the ray passes the nearer. */
+static disti_guess disti_predict_axis(const disti_tracer *tracer, const disti_ray *ray, int at, int end, int h,
+                                      int stride)
+{
+    disti_guess guess;
+    memset(&guess, 0, sizeof guess);
+    float near = 0.1f * tracer->field->radius;
+    float z1 = disti_hit_depth(ray, at, end, -h, stride), z2 = disti_hit_depth(ray, at, end, h, stride);
+    if (!(z1 > 0.0f && z2 > 0.0f)) return guess;
+    float a = disti_hit_depth(ray, at, end, -3 * h, stride), b = disti_hit_depth(ray, at, end, 3 * h, stride);
+    int near_a = a > 0.0f && a - z1 < near && z1 - a < near, near_b = b > 0.0f && b - z2 < near && z2 - b < near;
+    float slope1 = ray[-h * stride].slope, slope2 = ray[h * stride].slope;
+    float flatter = DISTI_MAX(slope1, slope2), mean = 0.5f * (slope1 + slope2), gap = z1 < z2 ? z2 - z1 : z1 - z2;
+    if (!(flatter < 0.0f)) return guess;
+    /* a plane inclined as the slopes say, not a step: |dz| <= tan(angle) times their distance, 2 h pixels */
+    float tangent = sqrtf(DISTI_MAX(tracer->lipschitz * tracer->lipschitz - mean * mean, 0.0f)) / -mean;
+    float across = 4.0f * (float)h * ray->footprint * DISTI_MAX(z1, z2);
+    float inverse = 0.5f * (1.0f / z1 + 1.0f / z2);
+    guess.slope = mean;
+    guess.quality = flatter <= 0.4f * DISTI_MIN(slope1, slope2) ? 2 : 1;
+    if (gap > near || gap > 1.2f * (tangent + 0.3f) * across) {
+        float z = z1 > z2 ? z1 : z2, beyond = z1 > z2 ? a : b;
+        int follows = z1 > z2 ? near_a : near_b;
+        inverse = follows ? 1.5f / z - 0.5f / beyond : 1.0f / z;
+        guess.slope = z1 > z2 ? slope1 : slope2;
+        guess.quality = -1;
+    } else if (near_a && near_b) {
+        inverse = (9.0f / z1 + 9.0f / z2 - 1.0f / a - 1.0f / b) * 0.0625f;
+        float off1 = ray[-h * stride].off, off2 = ray[h * stride].off;
+        if (off1 > 0.0f && off2 > 0.0f) guess.off = DISTI_MAX(off1, off2);
+        guess.quality += guess.quality == 2;
+    }
+    guess.depth = 1.0f / inverse;
+    return guess;
+}
+
+/* Sets up pixel (x, y) for its first query, half way between pixels at distance h known along x, y or both. 0: it
+   needs none: between four hits alike which were themselves predicted to within epsilon, it is interpolated. */
+static int disti_predict(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench, int x, int y,
                           int h)
 {
     disti_ray *ray = &bench->rays[y * tile->width + x];
-    float z[2] = {0.0f, 0.0f}, slopes[2] = {0.0f, 0.0f};
     int odd_x = x / h & 1, odd_y = y / h & 1;
-    int good = 1;
-    if (odd_x) good = disti_predict_axis(tracer, ray, x, tile->width, h, 1, &z[0], &slopes[0]);
-    if (odd_y) good = disti_predict_axis(tracer, ray, y, tile->height, h, tile->width, &z[1], &slopes[1]) && good;
-    float scale = odd_x && odd_y ? 0.5f : 1.0f;
-    float depth = scale * (z[0] + z[1]), slope = scale * (slopes[0] + slopes[1]);
+    disti_guess guess, other;
+    guess = disti_predict_axis(tracer, ray, odd_x ? x : y, odd_x ? tile->width : tile->height, h,
+                               odd_x ? 1 : tile->width);
+    if (odd_x && odd_y) {
+        other = disti_predict_axis(tracer, ray, y, tile->height, h, tile->width);
+        if (guess.quality > 0 && other.quality > 0) {
+            guess.depth = 0.5f * (guess.depth + other.depth);
+            guess.slope = 0.5f * (guess.slope + other.slope);
+            guess.off = guess.off > 0.0f && other.off > 0.0f ? DISTI_MAX(guess.off, other.off) : 0.0f;
+            guess.quality = DISTI_MIN(guess.quality, other.quality);
+        } else {
+            if (guess.quality <= 0 && other.quality > 0) guess = other;
+            guess.quality = guess.quality ? -1 : 0;
+        }
+    }
     ray->mode = DISTI_FIRST;
     ray->q = ray->start;
-    if (!good || !(slope < -0.12f * tracer->lipschitz)) return;
-    float s = (float)((double)(depth / ray->cosine) - ray->base);
-    if (!(s > ray->start && s < ray->leave)) return;
-    if (-slope * (s - ray->start) > ray->guard) return; /* something nearer makes f small at the cones' stop */
-    ray->mode = DISTI_PREDICT;
-    ray->side = 0;
-    ray->slope = slope;
-    ray->q = s;
+    if (guess.quality == 0 || !(guess.slope < -0.12f * tracer->lipschitz)) return 1;
+    float s = (float)((double)(guess.depth / ray->cosine) - ray->base);
+    float epsilon = disti_ray_epsilon(tracer, ray, s);
+    if (!(s > ray->start && s < ray->leave)) return 1;
+    ray->aim = (unsigned char)(guess.quality >= 2 ? 1 : 2);
+    ray->target = s;
+    ray->incline = guess.slope;
+    ray->s = ray->start;
+    if (guess.quality > 0 && disti_ray_aims(tracer, ray, ray->guard - 1e-3f * tracer->field->radius)) {
+        if (h == 1 && guess.quality == 3 && guess.off > 0.0f && guess.off <= epsilon) {
+            ray->slope = guess.slope;
+            ray->off = guess.off;
+            return disti_ray_end(ray, DIST_RAY_HIT, s, 0.0f, 2.0f * (guess.off + epsilon));
+        }
+        disti_ray_aim(ray);
+    }
+    return 1;
+}
+
+/* Width of a pixel at the field's center. */
+static float disti_tile_pixel(const disti_tracer *tracer, const disti_tile *tile)
+{
+    double c[3];
+    for (int i = 0; i < 3; i++) c[i] = tile->view->center[i] - (double)tracer->field->center[i];
+    return (float)(sqrt(disti_dot(c, c)) / DISTI_MAX(fabs(tile->view->fx), fabs(tile->view->fy)));
 }
 
 static void disti_trace_lattice(const disti_tracer *tracer, int worker, const disti_tile *tile, disti_bench *bench)
@@ -7848,8 +8009,16 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
     size_t active = 0;
     bench->balls = (disti_balls *)(void *)bench->rest;
     bench->width = tile->width;
-    bench->publish = 1;
-    memset(bench->balls->count, 0, sizeof bench->balls->count);
+    bench->height = tile->height;
+    bench->least = 0.4f * disti_tile_pixel(tracer, tile);
+    bench->balls->count = 0;
+    bench->balls->window = 3;
+    memset(bench->balls->head, 0, sizeof bench->balls->head);
+    for (int i = 0; i < tile->width * tile->height; i++) {
+        disti_cover *cover = &bench->balls->cover[i];
+        for (int k = 0; k < DISTI_COVERS; k++) cover->from[k] = cover->to[k] = -3e38f;
+        cover->seen = 0;
+    }
     for (int i = 0; i < tile->width * tile->height; i++) {
         disti_ray *ray = &bench->rays[i];
         if (ray->mode == DISTI_DONE) continue;
@@ -7858,22 +8027,21 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
     }
     disti_trace_rounds(tracer, worker, bench, active);
     for (int h = DISTI_LATTICE / 2; h > 0; h /= 2) {
-        bench->publish = h > 1;
+        bench->balls->window = DISTI_MIN(h + 3, 6);
         for (int pass = 1; pass <= 2; pass++) { /* between two known pixels, then amid four */
             active = 0;
             for (int y = 0; y < tile->height; y += h) {
                 for (int x = 0; x < tile->width; x += h) {
                     int index = y * tile->width + x;
                     if ((x / h & 1) + (y / h & 1) != pass || bench->rays[index].mode != DISTI_WAIT) continue;
-                    disti_predict(tracer, tile, bench, x, y, h);
-                    bench->index[active++] = index;
+                    if (disti_predict(tracer, tile, bench, x, y, h)) bench->index[active++] = index;
+                    else if (bench->budget) bench->budget->hits++;
                 }
             }
             disti_trace_rounds(tracer, worker, bench, active);
         }
     }
     bench->balls = NULL;
-    bench->publish = 0;
 }
 
 /* Soft silhouette of the rays that miss: min |f| along each. Cones and stretched steps leave no sample near the
@@ -9856,8 +10024,7 @@ static int disti_extract_mark(disti_extract *x, size_t slab)
     const dist_field *field = x->field;
     const float *sdf = x->batch + 3 * DISTI_MESH_BATCH;
     double half = 0.5 * (double)x->block;
-    double slope = 1.1 *
-                   (field->lipschitz > 0.0f ? (double)field->lipschitz : 1.0); /* the figure is often an estimate */
+    double slope = 1.1 * (double)disti_steepest(field); /* the figure is often an estimate */
     double reach = slope * 1.7320508075688772 * half * 2.0 * (double)field->radius / (double)x->cells;
     size_t total = x->blocks * x->blocks;
     if (x->no_skip) {
@@ -10074,7 +10241,7 @@ static int disti_extract_begin(disti_extract *x)
 /* Blocks of 8 cells, smaller where a clamped field could never rule one out; if 2 are still too many, all cells. */
 static void disti_extract_blocks(disti_extract *x)
 {
-    double slope = 2.0 * (x->field->lipschitz > 0.0f ? (double)x->field->lipschitz : 1.0);
+    double slope = 2.0 * (double)disti_steepest(x->field);
     double diagonal = slope * 1.7320508075688772 * (double)x->field->radius / (double)x->cells; /* half of one cell's */
     double visible = (double)x->field->clamp - fabs((double)x->level);
     x->block = 8;

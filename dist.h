@@ -7997,7 +7997,7 @@ static int disti_predict(const disti_tracer *tracer, const disti_tile *tile, con
 }
 
 /* Width of a pixel at the field's center. */
-static float disti_tile_pixel(const disti_tracer *tracer, const disti_tile *tile)
+static float disti_pixel_width(const disti_tracer *tracer, const disti_tile *tile)
 {
     double c[3];
     for (int i = 0; i < 3; i++) c[i] = tile->view->center[i] - (double)tracer->field->center[i];
@@ -8010,7 +8010,7 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
     bench->balls = (disti_balls *)(void *)bench->rest;
     bench->width = tile->width;
     bench->height = tile->height;
-    bench->least = 0.4f * disti_tile_pixel(tracer, tile);
+    bench->least = 0.4f * disti_pixel_width(tracer, tile);
     bench->balls->count = 0;
     bench->balls->window = 3;
     memset(bench->balls->head, 0, sizeof bench->balls->head);

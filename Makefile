@@ -30,7 +30,23 @@ OPENMP = $(eval OPENMP := $(shell mkdir -p build && echo 'int main(void) { retur
 # Pictures are written as PNG where stb_image_write.h is found, else as PPM.
 STB = -isystem build/stb/usr/include
 
+# Libraries to compare with and to hook in, each where it is installed: $(call installed,flags of a program that needs it)
+installed = $(shell mkdir -p build && echo 'int main(void) { return 0; }' > build/probe.c && \
+            echo '\#include <$(1)>' | $(CC) -E - >/dev/null 2>&1 && $(CC) build/probe.c $(3) -o build/probe 2>/dev/null && \
+            echo $(2) $(3))
+CBLAS = $(call installed,cblas.h,-DWITH_CBLAS,-lopenblas)
+DNNL = $(call installed,dnnl.h,-DWITH_DNNL,-ldnnl)
+
 all: $(PROGRAMS) $(BENCHES)
+
+build/bench_blas: bench/bench_blas.c dist.h $(wildcard examples/*.h bench/*.h)
+	$(CC) $(CFLAGS) $(STRICT) $(OPENMP) $< -o $@ $(CBLAS) $(DNNL) -lm
+
+build/blas: examples/blas.c dist.h $(wildcard examples/*.h)
+	$(CC) $(CFLAGS) $(STRICT) $(OPENMP) $< -o $@ $(CBLAS) -lm
+
+build/scheduler: examples/scheduler.c dist.h $(wildcard examples/*.h)
+	$(CC) $(CFLAGS) $(STRICT) $(OPENMP) -pthread $< -o $@ -lm
 
 build/%: examples/%.c dist.h $(wildcard examples/*.h) | build/stb/done
 	$(CC) $(CFLAGS) $(STRICT) $(OPENMP) $(STB) $< -o $@ -lm

@@ -1341,7 +1341,7 @@ DIST_API int dist_context_workers(const dist_context *ctx)
 enum { DISTI_BLOCK = 48 };
 
 /* forward   y[o][c] = bias[o] + sum_k weights(o, k) x[k][c]     k ascending over alive[0..alive_count-1], or all rows
-             with mask: y = max(0, y) and bit c of mask[o] = y[o][c] > 0
+             with relu or mask: y = max(0, y); bit c of mask[o] = y[o][c] > 0
    Leaving out rows that are zero for the whole block changes no bit of the result.
    All matrices are 64-byte aligned; y, bias and mask hold `out` rounded up to a multiple of 8; columns beyond `columns`
    may be computed from what stands there, up to DISTI_BLOCK, but their mask bits are 0. */
@@ -1351,8 +1351,8 @@ typedef struct disti_gemm {
     const float *x;
     float *y;
     const int *alive; /* NULL: all rows */
-    uint64_t *mask;   /* NULL: no ReLU */
-    int rows, alive_count, out, columns;
+    uint64_t *mask;   /* NULL: not asked for */
+    int rows, alive_count, out, columns, relu;
 } disti_gemm;
 
 /* backward  d_x[k][c] = (bit c of mask[k]) * sum_o weights(o, k) d_y[o][c]     o ascending over alive_out, k listed
@@ -1404,7 +1404,7 @@ static void disti_gemm_scalar(const disti_gemm *g)
         uint64_t bits = 0;
         for (int c = 0; c < g->columns; c++) {
             y[c] += 0.0f; /* minus zero becomes zero, so that a zero row left out cannot show in its sign */
-            if (!g->mask) continue;
+            if (!g->mask && !g->relu) continue;
             if (y[c] > 0.0f) bits |= (uint64_t)1 << c;
             else y[c] = 0.0f;
         }
@@ -1522,6 +1522,8 @@ static void disti_outer_scalar(const float *w, const float *s, const int *alive,
 #define DISTI_STORE_RELU1(i, j)                                                                                        \
     DISTI_BITS(mask + i, c + j * DISTI_LANES, a##i##j)                                                                 \
     DISTI_STORE(y + i * DISTI_BLOCK + j * DISTI_LANES, DISTI_RELU(a##i##j));
+#define DISTI_STORE_POSITIVE1(i, j) DISTI_STORE(y + i * DISTI_BLOCK + j * DISTI_LANES, DISTI_RELU(a##i##j));
+#define DISTI_STORE_POSITIVE(i, V) DISTI_X##V(DISTI_STORE_POSITIVE1, i)
 #define DISTI_STORE_SUM1(i, j) DISTI_STORE(y + i * DISTI_BLOCK + j * DISTI_LANES, DISTI_ADD(a##i##j, DISTI_SET1(0.0f)));
 #define DISTI_STORE_SUM(i, V) DISTI_X##V(DISTI_STORE_SUM1, i)
 #define DISTI_STORE_RELU(i, V) DISTI_X##V(DISTI_STORE_RELU1, i)
@@ -1563,11 +1565,13 @@ static void disti_outer_scalar(const float *w, const float *s, const int *alive,
             }                                                                                                          \
             for (; w < end; w += 8, x += DISTI_BLOCK) DISTI_STEP(R, V, DISTI_SIDE, w, x)                               \
         }                                                                                                              \
-        if (g->mask && to == (g->alive ? g->alive_count : g->rows)) {                                                  \
+        if (to < (g->alive ? g->alive_count : g->rows) || !(g->mask || g->relu)) {                                     \
+            DISTI_Y##R(DISTI_STORE_SUM, V)                                                                             \
+        } else if (g->mask) {                                                                                          \
             uint64_t *mask = g->mask + o;                                                                              \
             DISTI_Y##R(DISTI_STORE_RELU, V)                                                                            \
         } else {                                                                                                       \
-            DISTI_Y##R(DISTI_STORE_SUM, V)                                                                             \
+            DISTI_Y##R(DISTI_STORE_POSITIVE, V)                                                                        \
         }                                                                                                              \
     }
 
@@ -1952,6 +1956,8 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_AHEAD
 #undef DISTI_VECTORS
 #undef DISTI_STORE_RELU1
+#undef DISTI_STORE_POSITIVE1
+#undef DISTI_STORE_POSITIVE
 #undef DISTI_STORE_SUM1
 #undef DISTI_STORE_SUM
 #undef DISTI_STORE_RELU
@@ -4359,6 +4365,7 @@ struct dist_shape {
     float *code;
     float *bias; /* (layers + 1, max_rows): each layer's bias with the code folded in; then zeros, for tangents */
     float lipschitz, lipschitz_far;
+    uint32_t all_alive; /* bit l: the samples of disti_shape_slope met no dead unit at layer l's input */
     dist_shape *texture; /* the net that colors it, with [code, color code] folded in; NULL: none */
     float *store; /* activations and deltas of store_blocks blocks, for weight gradients */
     size_t store_block_size;
@@ -4382,6 +4389,7 @@ typedef struct disti_block {
     int alive_count[DISTI_MAX_LAYERS];
     int alive_units[DISTI_MAX_LAYERS]; /* of them, units: those before the encoded point's rows */
     int columns;
+    int values; /* no reverse pass follows: masks and slopes need not be kept */
     int channel, channels; /* the output's channels that the reverse pass starts from: the distance, or r, g, b */
     int half; /* 0; or B / 2: lane c + half is the tangent of lane c, see disti_second_block */
 } disti_block;
@@ -4575,16 +4583,27 @@ static void disti_positive(size_t rows, const float *y, uint64_t *mask)
     }
 }
 
-/* Lists the alive rows of layer l's input; the encoded point's rows always are. */
-static void disti_list_alive(const dist_net *net, disti_block *b, int l)
+/* Whether no row of layer l's input is looked at for being dead: where none can be, or where only values are wanted and
+   the shape's samples met none. */
+static int disti_all_alive(const dist_shape *shape, const disti_block *b, int l)
 {
+    return shape->net->activation != DIST_ACTIVATION_RELU || (b->values && (shape->all_alive >> l & 1));
+}
+
+/* Lists the alive rows of layer l's input; the encoded point's rows always are. */
+static void disti_list_alive(const dist_shape *shape, disti_block *b, int l)
+{
+    const dist_net *net = shape->net;
     const disti_linear *layer = &net->layer[l];
     uint64_t *mask = b->mask + (size_t)l * (size_t)net->max_rows;
     int *alive = b->alive + (size_t)l * (size_t)net->max_rows;
-    int count = 0, relu = net->activation == DIST_ACTIVATION_RELU;
+    int count = 0;
+    b->alive_units[l] = layer->prev;
+    b->alive_count[l] = layer->prev + layer->point;
+    if (disti_all_alive(shape, b, l)) return; /* no list: nobody reads one that leaves nothing out */
     for (int u = 0; u < layer->prev; u++) {
         alive[count] = u;
-        count += !relu || mask[u] != 0;
+        count += mask[u] != 0;
     }
     b->alive_units[l] = count;
     for (int i = 0; i < layer->point; i++) {
@@ -4687,7 +4706,8 @@ static void disti_hidden(const dist_shape *shape, const disti_kernels *kernels, 
         g.rows = layer->prev + layer->point;
         g.alive = b->alive_count[l] < g.rows ? b->alive + (size_t)l * width : NULL;
         g.alive_count = b->alive_count[l];
-        g.mask = plain ? mask : NULL;
+        g.mask = plain && !disti_all_alive(shape, b, l + 1) ? mask : NULL;
+        g.relu = plain;
         g.out = layer->out;
         g.columns = b->columns;
         kernels->gemm(&g);
@@ -4704,7 +4724,7 @@ static void disti_hidden(const dist_shape *shape, const disti_kernels *kernels, 
     }
     const disti_linear *next = &net->layer[l + 1];
     if (next->point > 0) memcpy(y + out * DISTI_BLOCK, b->point, (size_t)next->point * DISTI_BLOCK * sizeof(float));
-    disti_list_alive(net, b, l + 1);
+    disti_list_alive(shape, b, l + 1);
 }
 
 /* All hidden layers of the block whose encoded points stand in b->point. Returns the last layer's input.
@@ -4715,7 +4735,7 @@ static const float *disti_net_forward(const dist_shape *shape, disti_block *b, f
     disti_kernels kernels = disti_kernels_for(shape->ctx->isa);
     const float *x = b->point;
     double done = 0.0;
-    disti_list_alive(net, b, 0);
+    disti_list_alive(shape, b, 0);
     for (int l = 0; l < net->layers; l++) {
         const disti_linear *layer = &net->layer[l];
         size_t rows = (size_t)(layer->prev + layer->point);
@@ -4752,7 +4772,7 @@ static void disti_net_output(const dist_shape *shape, const disti_block *b, cons
         if (curvature) curvature[c] = 0.0f;
         if (!disti_finite(v)) continue; /* value stays what it is: the ray is told */
         for (int k = 0; k < twice + (twice || net->output == DISTI_OUTPUT_TANH); k++) {
-            float t = disti_tanh(v), s = disti_tanh_slope(v);
+            float t = disti_tanh(v), s = b->values ? 0.0f : disti_tanh_slope(v);
             bend = s * (bend - 2.0f * t * d * d); /* of t(v): t'' v'^2 + t' v'' */
             d *= s;
             v = t;
@@ -4983,6 +5003,7 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
     for (size_t at = 0; at < n; at += DISTI_BLOCK) {
         size_t count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK);
         disti_block_begin(shape, worker, &b, count, points + 3 * at);
+        b.values = !gradient && !seed_fn;
         float *value = b.tail, *slope = b.tail + DISTI_BLOCK, *seed = b.tail + 2 * DISTI_BLOCK,
               *g = b.tail + 8 * DISTI_BLOCK;
         const float *x = disti_net_forward(shape, &b, NULL, disti_counter_of(shape->ctx, worker));
@@ -5066,9 +5087,91 @@ static void disti_shape_second(void *user, int worker, size_t n, const float *po
 }
 #endif
 
+/* A BLAS wants wider matrices than our blocks: values alone go through its layers this many blocks at a time. */
+enum { DISTI_WIDE = 8, DISTI_WIDE_COLUMNS = DISTI_WIDE * DISTI_BLOCK };
+
+/* Floats of scratch for that; 0 for a net with a hidden layer that is too narrow or normed, or without a BLAS. */
+static size_t disti_wide_floats(const dist_context *ctx, const dist_net *net)
+{
+    for (int l = 1; l + 1 < net->layers; l++)
+        if (!ctx->blas.sgemm_fn || net->layer[l].out < ctx->blas_width || net->layer[l].prev < ctx->blas_width) return 0;
+    if (net->normed || net->layers < 3) return 0;
+    return (size_t)(2 * net->max_rows + net->point_size) * DISTI_WIDE_COLUMNS;
+}
+
+/* Hidden layer l by the BLAS: y = activation(W x + W_point point + bias), rows of DISTI_WIDE_COLUMNS. */
+static void disti_wide_hidden(const dist_shape *shape, int l, int columns, const float *x, const float *point, float *y)
+{
+    const dist_net *net = shape->net;
+    const disti_linear *layer = &net->layer[l];
+    const dist_blas *blas = &shape->ctx->blas;
+    const float *w = net->params + layer->weight, *bias = shape->bias + (size_t)l * (size_t)net->max_rows;
+    const int ld = DISTI_WIDE_COLUMNS;
+    blas->sgemm_fn(blas->user, 0, 0, layer->out, columns, layer->prev, layer->scale, w + layer->x_column, layer->in, x,
+                   ld, 0.0f, y, ld);
+    if (layer->point > 0)
+        blas->sgemm_fn(blas->user, 0, 0, layer->out, columns, layer->point, layer->scale, w + layer->point_column,
+                       layer->in, point, ld, 1.0f, y, ld);
+    for (size_t o = 0; o < (size_t)layer->out; o++) {
+        float *row = y + o * DISTI_WIDE_COLUMNS;
+        for (const float *end = row + columns; row < end; row += DISTI_BLOCK) {
+            for (int c = 0; c < DISTI_BLOCK; c++) row[c] += bias[o];
+            for (int c = 0; net->activation == DIST_ACTIVATION_RELU && c < DISTI_BLOCK; c++)
+                row[c] = row[c] > 0.0f ? row[c] : 0.0f;
+            if (net->activation != DIST_ACTIVATION_RELU)
+                disti_activate(net->activation, net->scale, DISTI_BLOCK, row, NULL);
+        }
+    }
+}
+
+/* One block's rows from a matrix of the stride `from` to one of the stride `to`. */
+static void disti_copy_rows(size_t rows, const float *x, size_t from, float *y, size_t to)
+{
+    for (size_t u = 0; u < rows; u++) memcpy(y + u * to, x + u * from, DISTI_BLOCK * sizeof(float));
+}
+
+static void disti_wide_eval(const dist_shape *shape, int worker, size_t n, const float *points, float *sdf)
+{
+    const dist_net *net = shape->net;
+    const disti_linear *last = &net->layer[net->layers - 1];
+    disti_kernels kernels = disti_kernels_for(shape->ctx->isa);
+    disti_block b;
+    size_t bytes = disti_block_layout(net, NULL, &b), stride = DISTI_WIDE_COLUMNS;
+    float *point = (float *)(void *)(disti_scratch(shape->ctx, worker) + DISTI_FIELD_OFFSET + bytes);
+    float *wide[2];
+    wide[0] = point + (size_t)net->point_size * stride;
+    wide[1] = wide[0] + (size_t)net->max_rows * stride;
+    for (size_t at = 0; at < n; at += stride) {
+        size_t count = DISTI_MIN(n - at, stride), blocks = (count + DISTI_BLOCK - 1) / DISTI_BLOCK;
+        for (size_t j = 0; j < blocks; j++) {
+            size_t first = at + j * DISTI_BLOCK;
+            disti_block_begin(shape, worker, &b, DISTI_MIN(n - first, (size_t)DISTI_BLOCK), points + 3 * first);
+            b.columns = DISTI_BLOCK;
+            disti_list_alive(shape, &b, 0);
+            disti_hidden(shape, &kernels, &b, 0, b.point, b.act[0]);
+            disti_copy_rows((size_t)net->layer[0].out, b.act[0], DISTI_BLOCK, wide[0] + j * DISTI_BLOCK, stride);
+            disti_copy_rows((size_t)net->point_size, b.point, DISTI_BLOCK, point + j * DISTI_BLOCK, stride);
+        }
+        for (int l = 1; l + 1 < net->layers; l++)
+            disti_wide_hidden(shape, l, (int)(blocks * DISTI_BLOCK), wide[(l - 1) & 1], point, wide[l & 1]);
+        for (size_t j = 0; j < blocks; j++) {
+            size_t first = at + j * DISTI_BLOCK;
+            b.alive_count[net->layers - 1] = last->prev + last->point;
+            disti_copy_rows((size_t)last->prev, wide[net->layers & 1] + j * DISTI_BLOCK, stride, b.act[0], DISTI_BLOCK);
+            disti_copy_rows((size_t)last->point, point + j * DISTI_BLOCK, stride,
+                            b.act[0] + (size_t)last->prev * DISTI_BLOCK, DISTI_BLOCK);
+            disti_net_output(shape, &b, b.act[0], net->sdf_channel, b.tail, b.tail + DISTI_BLOCK, NULL);
+            memcpy(sdf + first, b.tail, DISTI_MIN(n - first, (size_t)DISTI_BLOCK) * sizeof(float));
+        }
+    }
+    disti_counter_of(shape->ctx, worker)->done += (double)dist_net_operations(net, 1) * (double)n;
+}
+
 static void disti_shape_eval_fn(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
 {
-    disti_shape_fused(user, worker, n, points, sdf, gradient, NULL, NULL, NULL);
+    const dist_shape *shape = (const dist_shape *)user;
+    if (!gradient && disti_wide_floats(shape->ctx, shape->net) > 0) disti_wide_eval(shape, worker, n, points, sdf);
+    else disti_shape_fused(user, worker, n, points, sdf, gradient, NULL, NULL, NULL);
 }
 
 /* All channels (n, channels), or `count` of them from `first`. */
@@ -5079,6 +5182,7 @@ static void disti_shape_channels(const dist_shape *shape, int worker, size_t n, 
         disti_block b;
         size_t columns = DISTI_MIN(n - at, (size_t)DISTI_BLOCK);
         disti_block_begin(shape, worker, &b, columns, points + 3 * at);
+        b.values = 1;
         const float *x = disti_net_forward(shape, &b, NULL, disti_counter_of(shape->ctx, worker));
         for (int k = 0; k < count; k++) {
             disti_net_output(shape, &b, x, first + k, b.tail, b.tail + DISTI_BLOCK, NULL);
@@ -5346,7 +5450,7 @@ static void disti_shape_color_weights_fn(void *user, dist_context *ctx, size_t n
 /* Sampled |grad f| outside the surface: the 4/5 quantile near it, 31/32 beyond disti_far_from, at least 1. What matters
    is not the steepest spot but how far f exceeds the distance, which is its mean slope on the way. Half of the 768
    points are those of a fixed low-discrepancy sequence (the plastic number's) in the bounding sphere, half are these
-   moved along their gradients to a place near the surface. */
+   moved along their gradients to a place near the surface. Notes which layers meet no dead unit there. */
 static void disti_shape_slope(dist_shape *shape, const dist_field *field)
 {
     enum { ROUNDS = 16, BINS = 256 };
@@ -5354,6 +5458,9 @@ static void disti_shape_slope(dist_shape *shape, const dist_field *field)
     int bins[2][BINS], count[2] = {0, 0};
     float points[3 * DISTI_BLOCK], sdf[DISTI_BLOCK], gradient[3 * DISTI_BLOCK], slopes[2];
     float beyond = disti_far_from(field);
+    const dist_net *net = shape->net;
+    disti_block b;
+    shape->all_alive = ~(uint32_t)0;
     double u[3] = {0.5, 0.5, 0.5};
     memset(bins, 0, sizeof bins);
     for (int round = 0; round < ROUNDS; round++) {
@@ -5377,6 +5484,10 @@ static void disti_shape_slope(dist_shape *shape, const dist_field *field)
         unsigned state = disti_float_state_enter();
         field->eval_fn(shape, 0, DISTI_BLOCK, points, sdf, gradient);
         disti_float_state_leave(state);
+        disti_block_layout(net, disti_scratch(shape->ctx, 0) + DISTI_FIELD_OFFSET, &b);
+        for (int l = 1; l < net->layers; l++)
+            for (int k = 0; k < net->layer[l].prev; k++)
+                if (!b.mask[(size_t)l * (size_t)net->max_rows + (size_t)k]) shape->all_alive &= ~((uint32_t)1 << l);
         for (int j = 0; j < DISTI_BLOCK; j++) {
             const float *p = points + 3 * j, *g = gradient + 3 * j;
             float slope = disti_length(g[0], g[1], g[2]);
@@ -5510,7 +5621,9 @@ DIST_API dist_shape *dist_shape_create(dist_context *ctx, const dist_net *net, c
         disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_shape_create: net is NULL", NULL, 0, 0);
         return NULL;
     }
-    if (disti_scratch_reserve(ctx, DISTI_FIELD_OFFSET + disti_block_layout(net, NULL, &b)) != DIST_OK) return NULL;
+    if (disti_scratch_reserve(ctx, DISTI_FIELD_OFFSET + disti_block_layout(net, NULL, &b) +
+                                       disti_wide_floats(ctx, net) * sizeof(float)) != DIST_OK)
+        return NULL;
     if (disti_partial_reserve(ctx, (size_t)net->code_size + (size_t)net->code_size / DISTI_SLOTS + 1) != DIST_OK)
         return NULL;
     dist_shape *shape = (dist_shape *)disti_alloc(ctx, sizeof(dist_shape));

@@ -115,6 +115,7 @@ static void check_gemm_case(const disti_kernels *kernels, test_random *random, t
     g.alive = with_list ? list : NULL;
     g.alive_count = with_list ? random_list(random, size.rows, list) : 0;
     g.mask = with_mask ? mask : NULL;
+    g.relu = test_random_int(random, 0, 1);
     float *weights = panels(random, size.rows, size.out), *bias = floats((size_t)padded);
     float *x = block(random, size.rows, size.columns, g.alive, g.alive_count), *y = floats((size_t)padded * TEST_BLOCK);
     test_random_fill(random, (size_t)padded, bias, -1.0f, 1.0f);
@@ -135,7 +136,7 @@ static void check_gemm_case(const disti_kernels *kernels, test_random *random, t
                 size_sum += fabs(term);
             }
             const float got = y[o * TEST_BLOCK + c];
-            if (with_mask && sum < 0) sum = 0;
+            if ((with_mask || g.relu) && sum < 0) sum = 0;
             CHECK_NEAR(sum, got, bound(terms, size_sum));
             if (with_mask) CHECK((mask[o] >> c & 1) == (got > 0.0f));
         }

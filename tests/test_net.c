@@ -873,8 +873,10 @@ static void plain_sgemm(void *user, int transpose_a, int transpose_b, int m, int
         }
 }
 
+enum { BLAS_POINTS = 2 * DISTI_WIDE_COLUMNS + DISTI_BLOCK + 5 }; /* values alone go several blocks at a time */
+
 typedef struct blas_result {
-    float sdf[POINTS], gradient[3 * POINTS], code[5];
+    float sdf[POINTS], gradient[3 * POINTS], code[5], values[BLAS_POINTS];
     float *weights;
     int calls;
 } blas_result;
@@ -907,6 +909,9 @@ static void blas_run(int width, int use, int activation, blas_result *r)
     grads.weights = r->weights;
     CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &field, POINTS, points, r->sdf, r->gradient), ctx);
     CHECK_STATUS(DIST_OK, dist_field_backward(ctx, &field, POINTS, points, d_sdf, NULL, NULL, NULL, &grads), ctx);
+    static float many[3 * BLAS_POINTS];
+    test_random_fill(&random, 3 * BLAS_POINTS, many, -1.0f, 1.0f);
+    CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &field, BLAS_POINTS, many, r->values, NULL), ctx);
     r->calls = blas.calls;
     dist_shape_destroy(shape);
     dist_net_destroy(net);
@@ -924,6 +929,7 @@ TEST(the_users_blas_gives_the_same_numbers_for_wide_layers_and_is_left_alone_for
         CHECK((b.calls > 0) == (width >= 128));
         CHECK_NEAR_ARRAY(POINTS, a.sdf, b.sdf, 1e-6);
         CHECK_NEAR_ARRAY(3 * POINTS, a.gradient, b.gradient, 1e-6);
+        CHECK_NEAR_ARRAY(BLAS_POINTS, a.values, b.values, 1e-6);
         CHECK_NEAR_ARRAY(5, a.code, b.code, 1e-5);
         CHECK_NEAR_ARRAY((size_t)width * 9, a.weights, b.weights, 1e-5);
         free(a.weights);

@@ -2854,7 +2854,7 @@ static float disti_steepest(const dist_field *field)
                from dq = -q d log s - R^T (w x (p - t) + dt) / s, whatever branch phi took */
 typedef struct disti_placed {
     dist_field field;
-    float scale, rotation[9], translation[3];
+    float scale, inverse, rotation[9], translation[3]; /* inverse: 1 / scale */
     size_t code, offset; /* numbers of its field's code that have an adjoint; where they stand in the scene's */
     size_t color_offset; /* where its color code stands in the scene's */
 } disti_placed;
@@ -2872,7 +2872,7 @@ struct dist_scene {
     size_t scratch_bytes, code_size, color_code_size;
 };
 
-enum { DISTI_SCENE_CHUNK = 2048, DISTI_SCENE_PIECE = DISTI_BLOCK };
+enum { DISTI_SCENE_CHUNK = 2048, DISTI_SCENE_PIECE = DISTI_BLOCK, DISTI_CONTESTED = -2 };
 
 /* A worker's share of a scene's memory, for a chunk of points. */
 typedef struct disti_scene_work {
@@ -2886,7 +2886,8 @@ typedef struct disti_scene_work {
     float *best;   /* least value so far */
     int *winner;   /* its instance */
     unsigned char *asked; /* whether it came of a query rather than from a sphere */
-    int *kept;     /* choices put aside while other points are settled; -2: not put aside */
+    int *kept;     /* the only instance that may have to be asked, -1: none, or DISTI_CONTESTED */
+    float *nearest; /* lower of the winner, if it was asked */
 } disti_scene_work;
 
 static size_t disti_scene_layout(const dist_scene *scene, unsigned char *base, disti_scene_work *w)
@@ -2904,6 +2905,7 @@ static size_t disti_scene_layout(const dist_scene *scene, unsigned char *base, d
     w->winner = (int *)disti_take(base, &at, n, sizeof(int));
     w->asked = (unsigned char *)disti_take(base, &at, n, 1);
     w->kept = (int *)disti_take(base, &at, n, sizeof(int));
+    w->nearest = (float *)disti_take(base, &at, n, sizeof(float));
     return at;
 }
 
@@ -2912,47 +2914,51 @@ static float disti_ball_distance(const disti_ball *ball, const float *p)
     return disti_length(p[0] - ball->center[0], p[1] - ball->center[1], p[2] - ball->center[2]) - ball->radius;
 }
 
-/* q of p, and d and n in the shape's space. */
-static float disti_placed_local(const disti_placed *placed, const float *p, float q[3], float n[3])
+/* What is asked for p: q, or where the bounding sphere is nearest to it if it lies outside. */
+static void disti_placed_local(const disti_placed *placed, const float *p, int outside, float q[3])
 {
     const float *m = placed->rotation, *c = placed->field.center;
     float x[3];
-    for (int i = 0; i < 3; i++) x[i] = (p[i] - placed->translation[i]) / placed->scale;
-    for (int i = 0; i < 3; i++) {
-        q[i] = m[i] * x[0] + m[3 + i] * x[1] + m[6 + i] * x[2];
-        n[i] = q[i] - c[i];
-    }
-    float length = disti_length(n[0], n[1], n[2]);
-    for (int i = 0; i < 3; i++) n[i] = length > 0.0f ? n[i] / length : 0.0f;
-    return length - placed->field.radius;
+    for (int i = 0; i < 3; i++) x[i] = (p[i] - placed->translation[i]) * placed->inverse;
+    for (int i = 0; i < 3; i++) q[i] = m[i] * x[0] + m[3 + i] * x[1] + m[6 + i] * x[2];
+    if (!outside) return;
+    float share = placed->field.radius / disti_length(q[0] - c[0], q[1] - c[1], q[2] - c[2]);
+    for (int i = 0; i < 3; i++) q[i] = c[i] + share * (q[i] - c[i]);
 }
 
-/* f_i and, from g = grad f, its gradient, and df_i/df; f: the field's answer. g and gradient may be NULL. */
-static float disti_placed_value(const disti_placed *placed, const float *p, float f, const float *g, float *gradient,
-                                float *weight)
+/* f_i at p, d from the sphere in the world, where the field answered f. */
+static float disti_placed_value(const disti_placed *placed, const disti_ball *ball, float d, float f)
 {
-    float q[3], n[3], slope[3] = {0.0f, 0.0f, 0.0f}, r = placed->field.radius, m = 0.2f * r, along = 0.0f;
-    float d = disti_placed_local(placed, p, q, n), b = f, w = 1.0f, cap = m + (d > m ? d - m : m - d);
-    for (int i = 0; g && i < 3; i++) {
-        slope[i] = g[i];
-        along += n[i] * g[i];
+    float b = placed->scale * f, m = ball->margin;
+    if (!disti_finite(b)) return b;
+    if (d > 0.0f) b = sqrtf(d * d + DISTI_MAX(b, 0.0f) * DISTI_MAX(b, 0.0f));
+    return DISTI_MIN(b, m + (d > m ? d - m : m - d));
+}
+
+/* The same with its gradient, from g = grad f, and weight = df_i/df. */
+static float disti_placed_gradient(const disti_placed *placed, const disti_ball *ball, const float *p, float d, float f,
+                                   const float *g, float *gradient, float *weight)
+{
+    const float *m = placed->rotation;
+    float n[3], v = DISTI_MAX(placed->scale * f, 0.0f), value = disti_placed_value(placed, ball, d, f), along = 0.0f;
+    float length = DISTI_MAX(d + ball->radius, 1e-30f);
+    *weight = placed->scale;
+    for (int i = 0; i < 3; i++) {
+        n[i] = (p[i] - ball->center[i]) / length;
+        gradient[i] = m[3 * i] * g[0] + m[3 * i + 1] * g[1] + m[3 * i + 2] * g[2];
+        along += n[i] * gradient[i];
     }
-    if (d > 0.0f && disti_finite(f)) {
-        float v = DISTI_MAX(f, 0.0f);
-        b = sqrtf(d * d + v * v);
-        w = v / b;
-        for (int i = 0; i < 3; i++) slope[i] = (d * n[i] + v * r / (r + d) * (slope[i] - n[i] * along)) / b;
+    if (!disti_finite(value)) return value;
+    float b = d > 0.0f ? sqrtf(d * d + v * v) : placed->scale * f;
+    if (b > value) {
+        *weight = 0.0f;
+        for (int i = 0; i < 3; i++) gradient[i] = d > ball->margin ? n[i] : -n[i];
+    } else if (d > 0.0f) {
+        *weight *= v / b;
+        for (int i = 0; i < 3; i++)
+            gradient[i] = (d * n[i] + v * ball->radius / length * (gradient[i] - n[i] * along)) / b;
     }
-    if (disti_finite(f) && b > cap) {
-        b = cap;
-        w = 0.0f;
-        for (int i = 0; i < 3; i++) slope[i] = d > m ? n[i] : -n[i];
-    }
-    const float *rotation = placed->rotation;
-    for (int i = 0; gradient && i < 3; i++)
-        gradient[i] = rotation[3 * i] * slope[0] + rotation[3 * i + 1] * slope[1] + rotation[3 * i + 2] * slope[2];
-    if (weight) *weight = placed->scale * w;
-    return placed->scale * b;
+    return value;
 }
 
 /* The instance to ask after (lower, choice): the next by d that may hold the minimum. */
@@ -2969,31 +2975,39 @@ static void disti_scene_next(const dist_scene *scene, const float *p, disti_scen
     }
 }
 
-/* The least of what is known without a query, and the first instance to ask. Returns whether there may be a second. */
-static int disti_scene_begin(const dist_scene *scene, const float *p, disti_scene_work *w, size_t i)
+/* The least of what is known without a query, and the first instance to ask. Returns whether there may be a second.
+   No ball farther than `limit` can hold the minimum: f_i <= m + |d - m| is known beforehand. `hint`: where to begin. */
+static int disti_scene_begin(const dist_scene *scene, const float *p, disti_scene_work *w, size_t i, int hint)
 {
-    float best = 3e38f, first = 3e38f, second = 3e38f;
+    float best = 3e38f, first = 3e38f, second = 3e38f, limit = 1e18f;
     w->choice[i] = -1;
-    w->winner[i] = 0;
+    w->winner[i] = hint;
     w->asked[i] = 0;
-    for (int k = 0; k < scene->count; k++) {
-        float d = disti_ball_distance(&scene->ball[k], p);
-        if (d >= scene->ball[k].margin) {
+    for (int k = -1; k < scene->count; k++) {
+        int at = k < 0 ? hint : k;
+        const disti_ball *ball = &scene->ball[at];
+        float x = p[0] - ball->center[0], y = p[1] - ball->center[1], z = p[2] - ball->center[2];
+        float square = x * x + y * y + z * z, reach = limit + ball->radius;
+        if (square >= reach * reach || k == hint) continue;
+        float d = sqrtf(square) - ball->radius, m = ball->margin;
+        if (d >= m) {
             if (d >= best) continue;
             best = d;
-            w->winner[i] = k;
-        } else if (d < first) {
-            second = first;
+            w->winner[i] = at;
+            limit = DISTI_MIN(limit, d);
+            continue;
+        }
+        limit = DISTI_MIN(limit, m + m - d);
+        second = DISTI_MIN(second, DISTI_MAX(first, d));
+        if (d < first) {
             first = d;
-            w->choice[i] = k;
-        } else if (d < second) {
-            second = d;
+            w->choice[i] = at;
         }
     }
     w->best[i] = disti_finite_all(3, p) ? best : p[0] + p[1] + p[2]; /* not finite either */
     w->lower[i] = first;
     if (first >= best || !disti_finite_all(3, p)) w->choice[i] = -1;
-    return w->choice[i] >= 0 && second < best;
+    return w->choice[i] >= 0 && second < DISTI_MIN(best, limit);
 }
 
 /* Puts the points in order of the instance that they ask, and what they ask into local. */
@@ -3006,13 +3020,9 @@ static void disti_scene_sort(const dist_scene *scene, size_t n, const float *poi
     for (size_t i = 0; i < n; i++) {
         if (w->choice[i] < 0) continue;
         const disti_placed *placed = &scene->placed[w->choice[i]];
-        float q[3], normal[3];
-        float d = disti_placed_local(placed, points + 3 * i, q, normal);
         size_t to = (size_t)w->start[w->choice[i]]++;
         w->order[to] = (int)i;
-        for (size_t axis = 0; axis < 3; axis++)
-            w->local[3 * to + axis] =
-                d > 0.0f ? placed->field.center[axis] + placed->field.radius * normal[axis] : q[axis];
+        disti_placed_local(placed, points + 3 * i, w->lower[i] > 0.0f, w->local + 3 * to);
     }
     for (int k = scene->count; k > 0; k--) w->start[k] = w->start[k - 1];
     w->start[0] = 0;
@@ -3034,14 +3044,15 @@ static void disti_scene_rounds(const dist_scene *scene, int worker, size_t n, co
         }
         for (size_t at = 0; at < total; at++) {
             size_t i = (size_t)w->order[at];
-            const float *p = points + 3 * i;
-            float f = disti_placed_value(&scene->placed[w->choice[i]], p, w->value[at], NULL, NULL, NULL);
+            int k = w->choice[i];
+            float f = disti_placed_value(&scene->placed[k], &scene->ball[k], w->lower[i], w->value[at]);
             if (!disti_finite(f) || f < w->best[i]) {
                 w->best[i] = f;
-                w->winner[i] = w->choice[i];
+                w->winner[i] = k;
                 w->asked[i] = 1;
+                w->nearest[i] = w->lower[i];
             }
-            if (disti_finite(f)) disti_scene_next(scene, p, w, i);
+            if (w->kept[i] == DISTI_CONTESTED && disti_finite(f)) disti_scene_next(scene, points + 3 * i, w, i);
             else w->choice[i] = -1;
         }
     }
@@ -3052,19 +3063,20 @@ static void disti_scene_rounds(const dist_scene *scene, int worker, size_t n, co
 static void disti_scene_settle(const dist_scene *scene, int worker, size_t n, const float *points, disti_scene_work *w,
                                int all)
 {
+    int hint = 0;
     for (size_t i = 0; i < n; i++) {
-        int contested = disti_scene_begin(scene, points + 3 * i, w, i);
-        w->kept[i] = all || contested ? -2 : w->choice[i];
-        if (w->kept[i] != -2) w->choice[i] = -1;
+        int contested = disti_scene_begin(scene, points + 3 * i, w, i, hint);
+        hint = w->choice[i] >= 0 ? w->choice[i] : w->winner[i];
+        w->kept[i] = contested ? (int)DISTI_CONTESTED : w->choice[i];
+        if (!all && !contested) w->choice[i] = -1;
     }
     disti_scene_rounds(scene, worker, n, points, w);
     for (size_t i = 0; i < n && !all; i++) {
-        if (w->kept[i] == -2 && w->asked[i]) {
-            w->choice[i] = w->winner[i];
-            w->best[i] = 3e38f;
-        } else {
-            w->choice[i] = w->kept[i] == -2 ? -1 : w->kept[i];
-        }
+        w->choice[i] = w->kept[i];
+        if (w->kept[i] != DISTI_CONTESTED) continue;
+        w->choice[i] = w->asked[i] ? w->winner[i] : -1;
+        w->lower[i] = w->nearest[i];
+        if (w->asked[i]) w->best[i] = 3e38f;
     }
 }
 
@@ -3127,11 +3139,12 @@ static void disti_scene_seed(void *user, size_t first, size_t count, const float
     for (size_t j = 0; j < count; j++) {
         size_t i = (size_t)w->order[link->group + first + j];
         float g[3], weight;
-        float f = disti_placed_value(&link->scene->placed[w->choice[i]], link->points + 3 * i, sdf[j],
-                                     gradient + 3 * j, g, &weight);
+        int k = w->choice[i];
+        float f = disti_placed_gradient(&link->scene->placed[k], &link->scene->ball[k], link->points + 3 * i,
+                                        w->lower[i], sdf[j], gradient + 3 * j, g, &weight);
         d_sdf[j] = 0.0f;
         if (disti_finite(f) && f >= w->best[i]) disti_scene_emit_ball(link, i);
-        else d_sdf[j] = weight * disti_scene_emit(link, i, w->choice[i], f, g);
+        else d_sdf[j] = weight * disti_scene_emit(link, i, k, f, g);
     }
 }
 
@@ -3235,8 +3248,11 @@ static void disti_scene_paint(const dist_scene *scene, int worker, size_t n, con
             if (pull.d_points) pull.d_points += 3 * at;
         }
         disti_scene_settle(scene, worker, count, points + 3 * at, &w, 0);
-        for (size_t i = 0; i < count; i++)
-            if (w.choice[i] < 0) w.choice[i] = w.winner[i];
+        for (size_t i = 0; i < count; i++) {
+            if (w.choice[i] >= 0) continue;
+            w.choice[i] = w.winner[i];
+            w.lower[i] = 1.0f; /* outside */
+        }
         disti_scene_sort(scene, count, points + 3 * at, &w);
         for (int k = 0; k < scene->count; k++) {
             const dist_field *field = &scene->placed[k].field;
@@ -3326,6 +3342,7 @@ static dist_status disti_scene_place(dist_scene *scene, int k, const dist_instan
                           function, off, determinant);
     disti_orthonormalize(m);
     next.scale = s->scale > 0.0f ? s->scale : 1.0f;
+    next.inverse = 1.0f / next.scale;
     disti_ball ball;
     for (int i = 0; i < 3; i++) {
         const float *c = next.field.center;

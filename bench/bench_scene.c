@@ -17,7 +17,8 @@ static const char usage[] =
 
 enum { MOST = 20, REPEATS = 5 };
 
-/* Points within the spheres of `count` instances, which stand on a grid of `spacing`, in runs as of neighboring rays. */
+/* Points within the spheres of `count` instances, which stand on a grid of `spacing`; 256 for each in turn, as rays of
+   one block ask. */
 static void place(dist_instance *instances, int count, float spacing, float radius, size_t n, float *points)
 {
     rng random = rng_begin(7);
@@ -28,7 +29,7 @@ static void place(dist_instance *instances, int count, float spacing, float radi
         dist_similarity_move(&instances[i].placement, move);
     }
     for (size_t i = 0; i < n; i++) {
-        const float *t = instances[i / 64 % (size_t)count].placement.translation;
+        const float *t = instances[i / 256 % (size_t)count].placement.translation;
         float p[3], square;
         do {
             square = 0;
@@ -103,8 +104,8 @@ int main(int argc, char **argv)
     size_t n = (size_t)points;
     float *at = take_floats(3 * n), *sdf = take_floats(n);
     double alone = 0;
-    printf("case,instances,points,net_queries,per_query,seconds,of_one,picture_queries,picture_net_queries,picture_per_query,"
-           "picture_seconds\n");
+    printf("case,instances,points,net_queries,per_query,seconds,of_one,"
+           "picture_queries,picture_net_queries,picture_per_query,picture_seconds\n");
     for (size_t i = 0; i < sizeof rows / sizeof rows[0]; i++) {
         dist_instance instances[MOST] = {{0}};
         dist_stats stats = {0};

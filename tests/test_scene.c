@@ -502,21 +502,22 @@ static void union_eval(void *user, int worker, size_t n, const float *points, fl
         float best = 3e38f;
         for (int k = 0; k < w->count; k++) {
             const part *a = &w->part[k];
-            float f, q[3], ask[3], normal[3], g[3], turned[3];
+            float f, ask[3], g[3], turned[3];
             disti_placed placed;
             memset(&placed, 0, sizeof placed);
             placed.field = a->field;
             placed.scale = a->placement.scale;
+            placed.inverse = 1.0f / placed.scale;
             memcpy(placed.rotation, a->placement.rotation, sizeof placed.rotation);
             memcpy(placed.translation, a->placement.translation, sizeof placed.translation);
-            float d = disti_placed_local(&placed, points + 3 * i, q, normal);
-            for (int axis = 0; axis < 3; axis++)
-                ask[axis] = d > 0.0f ? a->field.center[axis] + a->field.radius * normal[axis] : q[axis];
+            float d = disti_ball_distance(&w->scene->ball[k], points + 3 * i);
+            disti_placed_local(&placed, points + 3 * i, d > 0.0f, ask);
             a->field.eval_fn(a->field.user, worker, 1, ask, &f, g);
             for (int axis = 0; axis < 3; axis++)
                 turned[axis] = placed.rotation[3 * axis] * g[0] + placed.rotation[3 * axis + 1] * g[1] +
                                placed.rotation[3 * axis + 2] * g[2];
-            f = placed.scale * (d > 0.0f ? sqrtf(d * d + fmaxf(f, 0.0f) * fmaxf(f, 0.0f)) : f);
+            f *= placed.scale;
+            if (d > 0.0f) f = sqrtf(d * d + fmaxf(f, 0.0f) * fmaxf(f, 0.0f));
             if (f >= best) continue;
             best = f;
             if (gradient) memcpy(gradient + 3 * i, turned, sizeof turned);

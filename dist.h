@@ -1192,6 +1192,21 @@ static void *disti_take(unsigned char *base, size_t *at, size_t count, size_t si
     return p;
 }
 
+/* splitmix64: the same numbers everywhere for one seed. */
+DISTI_UNUSED static uint64_t disti_random_bits(uint64_t *state)
+{
+    uint64_t z = *state += 0x9e3779b97f4a7c15u;
+    z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9u;
+    z = (z ^ (z >> 27)) * 0x94d049bb133111ebu;
+    return z ^ (z >> 31);
+}
+
+/* Uniform in [0, 1). */
+DISTI_UNUSED static double disti_random_unit(uint64_t *state)
+{
+    return (double)(disti_random_bits(state) >> 11) * (1.0 / 9007199254740992.0);
+}
+
 static disti_counter *disti_counter_of(const dist_context *ctx, int worker)
 {
     return (disti_counter *)(void *)disti_scratch(ctx, worker);
@@ -4218,6 +4233,12 @@ typedef struct disti_tensor_out {
     const float *data;
 } disti_tensor_out;
 
+static dist_status disti_capacity(dist_context *ctx, const char *function, size_t capacity, size_t need)
+{
+    return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: capacity is %d, must be at least %d", function, (double)capacity,
+                      (double)need);
+}
+
 typedef struct disti_writer {
     unsigned char *out; /* NULL: only counted */
     size_t size;        /* SIZE_MAX if it does not fit */
@@ -4227,6 +4248,21 @@ static void disti_put(disti_writer *w, const void *bytes, size_t size)
 {
     if (w->out) memcpy(w->out + w->size, bytes, size);
     disti_size_add(w->size, size, &w->size);
+}
+
+/* Little-endian on every machine. */
+static void disti_put_word(disti_writer *w, uint32_t x)
+{
+    unsigned char bytes[4];
+    for (int i = 0; i < 4; i++) bytes[i] = (unsigned char)(x >> 8 * i & 255u);
+    disti_put(w, bytes, sizeof bytes);
+}
+
+static void disti_put_float(disti_writer *w, float x)
+{
+    uint32_t bits;
+    memcpy(&bits, &x, sizeof bits);
+    disti_put_word(w, bits);
 }
 
 static void disti_put_text(disti_writer *w, const char *text)
@@ -4319,9 +4355,7 @@ static dist_status disti_archive_write(dist_context *ctx, const char *function, 
         return disti_fail(ctx, DIST_OUT_OF_MEMORY, "%s: the tensors' size does not fit size_t", function, 0, 0);
     *size = total;
     if (!buffer) return DIST_OK;
-    if (capacity < total)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: capacity is %d, must be at least %d", function, (double)capacity,
-                          (double)total);
+    if (capacity < total) return disti_capacity(ctx, function, capacity, total);
     w.out = (unsigned char *)buffer;
     w.size = 8;
     for (size_t i = 0; i < 8; i++) w.out[i] = (unsigned char)((uint64_t)(begin - 8) >> 8 * i);
@@ -4329,13 +4363,7 @@ static dist_status disti_archive_write(dist_context *ctx, const char *function, 
     while (w.size < begin) disti_put(&w, " ", 1);
     for (size_t i = 0; i < tensor_count; i++) {
         size_t count = disti_tensor_out_bytes(&tensors[i]) / sizeof(float);
-        for (size_t k = 0; k < count; k++) {
-            uint32_t bits;
-            memcpy(&bits, tensors[i].data + k, sizeof bits);
-            unsigned char le[4] = {(unsigned char)bits, (unsigned char)(bits >> 8), (unsigned char)(bits >> 16),
-                                   (unsigned char)(bits >> 24)};
-            disti_put(&w, le, 4);
-        }
+        for (size_t k = 0; k < count; k++) disti_put_float(&w, tensors[i].data[k]);
     }
     return DIST_OK;
 }
@@ -6321,48 +6349,38 @@ DIST_API dist_status dist_net_save(dist_context *ctx, const dist_net *net, void 
 /* Reads a whole file into memory of the context; *size bytes, to be given back with disti_free. */
 static unsigned char *disti_file_read(dist_context *ctx, const char *function, const char *path, size_t *size)
 {
-    char text[200];
-    size_t n = 0, got = 0;
-    for (const char *c = function; *c && n < 40; c++) text[n++] = *c;
-    memcpy(text + n, ": ", 2);
-    n += 2;
-    for (const char *c = path ? path : "(null)"; *c && n + 1 < sizeof text; c++) text[n++] = *c;
-    text[n] = 0;
-    FILE *file = path ? fopen(path, "rb") : NULL;
     *size = 0;
-    if (!file) {
-        disti_fail(ctx, DIST_IO, "%s: cannot be opened", text, 0, 0);
-        return NULL;
-    }
-    long end = fseek(file, 0, SEEK_END) == 0 ? ftell(file) : -1;
-    if (end < 0 || end > 0x7ffffff0L || fseek(file, 0, SEEK_SET) != 0) {
-        fclose(file);
-        disti_fail(ctx, DIST_IO, "%s: is not a file that can be read whole", text, 0, 0);
-        return NULL;
-    }
-    unsigned char *bytes = (unsigned char *)disti_alloc(ctx, (size_t)end);
-    if (bytes) got = fread(bytes, 1, (size_t)end, file);
-    fclose(file);
-    if (bytes && got != (size_t)end) {
-        disti_free(ctx, bytes, (size_t)end);
-        disti_fail(ctx, DIST_IO, "%s: reading failed after %d of %d bytes", text, (double)got, (double)end);
-        return NULL;
-    }
-    *size = (size_t)end;
-    return bytes;
+    FILE *file = path ? fopen(path, "rb") : NULL;
+    long end = file && fseek(file, 0, SEEK_END) == 0 ? ftell(file) : -1;
+    int good = end >= 0 && end <= 0x7ffffff0L && fseek(file, 0, SEEK_SET) == 0;
+    unsigned char *bytes = good ? (unsigned char *)disti_alloc(ctx, (size_t)end) : NULL;
+    size_t got = bytes ? fread(bytes, 1, (size_t)end, file) : 0;
+    if (!path) disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: path is NULL", function, 0, 0);
+    else if (!file) disti_fail(ctx, DIST_IO, "%s: cannot be opened", path, 0, 0);
+    else if (!good) disti_fail(ctx, DIST_IO, "%s: is not a file that can be read whole", path, 0, 0);
+    else if (bytes && got != (size_t)end)
+        disti_fail(ctx, DIST_IO, "%s: reading failed after %d of %d bytes", path, (double)got, (double)end);
+    if (file) fclose(file);
+    if (bytes && got == (size_t)end) *size = got;
+    else if (bytes) disti_free(ctx, bytes, (size_t)end);
+    return bytes && got == (size_t)end ? bytes : NULL;
 }
 
-static dist_status disti_file_write(dist_context *ctx, const char *function, const char *path, const void *bytes,
-                                    size_t size)
+/* Writes and gives back bytes, which disti_alloc returned, unless status says that they were not made. */
+static dist_status disti_file_write(dist_context *ctx, const char *path, void *bytes, size_t size, dist_status status)
 {
-    (void)function;
-    FILE *file = path ? fopen(path, "wb") : NULL;
-    if (!file) return disti_fail(ctx, DIST_IO, "%s: cannot be opened for writing", path, 0, 0);
-    size_t put = fwrite(bytes, 1, size, file);
-    int closed = fclose(file);
-    if (put != size || closed != 0)
-        return disti_fail(ctx, DIST_IO, "%s: writing failed after %d of %d bytes", path, (double)put, (double)size);
-    return DIST_OK;
+    if (!bytes) return DIST_OUT_OF_MEMORY;
+    if (status == DIST_OK) {
+        FILE *file = path ? fopen(path, "wb") : NULL;
+        size_t put = file ? fwrite(bytes, 1, size, file) : 0;
+        int closed = file ? fclose(file) : 0;
+        if (!file) status = disti_fail(ctx, DIST_IO, "%s: cannot be opened for writing", path, 0, 0);
+        else if (put != size || closed != 0)
+            status = disti_fail(ctx, DIST_IO, "%s: writing failed after %d of %d bytes", path, (double)put,
+                                (double)size);
+    }
+    disti_free(ctx, bytes, size);
+    return status;
 }
 
 DIST_API dist_net *dist_net_load_file(dist_context *ctx, const char *path)
@@ -6370,8 +6388,7 @@ DIST_API dist_net *dist_net_load_file(dist_context *ctx, const char *path)
     size_t size;
     if (disti_enter(ctx, "dist_net_load_file") != DIST_OK) return NULL;
     unsigned char *bytes = disti_file_read(ctx, "dist_net_load_file", path, &size);
-    if (!bytes) return NULL;
-    dist_net *net = dist_net_load(ctx, bytes, size);
+    dist_net *net = bytes ? dist_net_load(ctx, bytes, size) : NULL;
     disti_free(ctx, bytes, size);
     return net;
 }
@@ -6381,28 +6398,17 @@ DIST_API dist_status dist_net_save_file(dist_context *ctx, const dist_net *net, 
     size_t size;
     dist_status status = dist_net_save(ctx, net, NULL, 0, &size);
     if (status != DIST_OK) return status;
-    unsigned char *bytes = (unsigned char *)disti_alloc(ctx, size);
-    if (!bytes) return DIST_OUT_OF_MEMORY;
-    status = dist_net_save(ctx, net, bytes, size, &size);
-    if (status == DIST_OK) status = disti_file_write(ctx, "dist_net_save_file", path, bytes, size);
-    disti_free(ctx, bytes, size);
-    return status;
+    void *bytes = disti_alloc(ctx, size);
+    if (bytes) status = dist_net_save(ctx, net, bytes, size, &size);
+    return disti_file_write(ctx, path, bytes, size, status);
 }
 #endif
 
 #ifndef DIST_NO_TRAIN
-/* splitmix64: uniform in [0, 1) and, by Box and Muller, standard normal. */
-static double disti_uniform(uint64_t *state)
-{
-    uint64_t z = *state += 0x9e3779b97f4a7c15u;
-    z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9u;
-    z = (z ^ (z >> 27)) * 0x94d049bb133111ebu;
-    return (double)((z ^ (z >> 31)) >> 11) * (1.0 / 9007199254740992.0);
-}
-
+/* By Box and Muller. */
 static double disti_normal(uint64_t *state)
 {
-    double u = disti_uniform(state), v = disti_uniform(state);
+    double u = disti_random_unit(state), v = disti_random_unit(state);
     double s, c;
     disti_sincos(6.28318530717958647692 * v, &s, &c);
     return sqrt(-2.0 * log(1.0 - u)) * c;
@@ -6424,7 +6430,7 @@ static void disti_net_randomize(dist_net *net, const dist_net_desc *desc)
             for (int k = 0; k < layer->in; k++) {
                 int is_code = k >= layer->code_column && k < layer->code_column + layer->code;
                 int is_point = k >= layer->point_column && k < layer->point_column + layer->point;
-                double x = (2.0 * disti_uniform(&state) - 1.0) * range;
+                double x = (2.0 * disti_random_unit(&state) - 1.0) * range;
                 if (desc->geometric) {
                     x = last ? sqrt(3.14159265358979 / in) + 1e-4 * disti_normal(&state)
                              : disti_normal(&state) * sqrt(2.0 / layer->out);
@@ -6432,7 +6438,7 @@ static void disti_net_randomize(dist_net *net, const dist_net_desc *desc)
                 }
                 w[k] = (float)x;
             }
-            double b = (2.0 * disti_uniform(&state) - 1.0) * range;
+            double b = (2.0 * disti_random_unit(&state) - 1.0) * range;
             net->params[layer->bias + (size_t)o] = desc->geometric ? (last ? -0.5f * net->bound : 0.0f) : (float)b;
         }
     }
@@ -9904,33 +9910,18 @@ DIST_API size_t dist_adam_step(dist_adam *adam, size_t n, float *x, const float 
 
 /*@ 11 mesh, metrics ------------------------------------------------------------------------------------------------ */
 
-/* splitmix64: the same numbers everywhere for one seed. */
-DISTI_UNUSED static uint64_t disti_random_bits(uint64_t *state)
-{
-    uint64_t z = *state += 0x9e3779b97f4a7c15u;
-    z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9u;
-    z = (z ^ (z >> 27)) * 0x94d049bb133111ebu;
-    return z ^ (z >> 31);
-}
-
 #ifndef DIST_NO_MESH
-/* Uniform in [0, 1). */
-static double disti_random_unit(uint64_t *state)
-{
-    return (double)(disti_random_bits(state) >> 11) * (1.0 / 9007199254740992.0);
-}
-
-/* A copy of array with room for at least one element of `each` bytes more, half as large again; the old one is given
-   back. NULL on failure: then the old one stays and *capacity with it. */
-static void *disti_grow(dist_context *ctx, void *array, size_t *capacity, size_t each)
+/* Sees to it that array (capacity, each) has room for one element behind `count`: half as large again where it has not.
+   NULL on failure: then the old one stays and *capacity with it. */
+static void *disti_grow(dist_context *ctx, void *array, size_t count, size_t *capacity, size_t each)
 {
     size_t more, bytes;
-    if (!disti_size_add(*capacity, *capacity / 2 + 64, &more) || !disti_size_mul(more, each, &bytes))
-        bytes = (size_t)-1;
+    if (count < *capacity) return array;
+    if (!disti_size_add(count, count / 2 + 64, &more) || !disti_size_mul(more, each, &bytes)) bytes = (size_t)-1;
     void *grown = disti_alloc(ctx, bytes);
     if (!grown) return NULL;
-    if (array) memcpy(grown, array, *capacity * each);
-    disti_free(ctx, array, *capacity * each);
+    if (array) memcpy(grown, array, count * each);
+    disti_free(ctx, array, count * each);
     *capacity = more;
     return grown;
 }
@@ -9957,11 +9948,10 @@ DIST_API void dist_mesh_destroy(dist_mesh *mesh)
 /* Both append and return 1, or 0 after disti_fail. */
 static int disti_mesh_add_vertex(dist_mesh *mesh, const float p[3])
 {
-    if (mesh->vertex_count == mesh->vertex_capacity) {
-        float *grown = (float *)disti_grow(mesh->owner, mesh->vertices, &mesh->vertex_capacity, 3 * sizeof(float));
-        if (!grown) return 0;
-        mesh->vertices = grown;
-    }
+    float *grown = (float *)disti_grow(mesh->owner, mesh->vertices, mesh->vertex_count, &mesh->vertex_capacity,
+                                       3 * sizeof(float));
+    if (!grown) return 0;
+    mesh->vertices = grown;
     if (mesh->vertex_count >= 0xfffffffeu) {
         disti_fail(mesh->owner, DIST_UNSUPPORTED, "mesh: more than 4294967294 vertices", NULL, 0, 0);
         return 0;
@@ -9972,59 +9962,48 @@ static int disti_mesh_add_vertex(dist_mesh *mesh, const float p[3])
 
 static int disti_mesh_add_triangle(dist_mesh *mesh, unsigned a, unsigned b, unsigned c)
 {
-    if (mesh->triangle_count == mesh->triangle_capacity) {
-        unsigned *grown = (unsigned *)disti_grow(mesh->owner, mesh->triangles, &mesh->triangle_capacity,
-                                                 3 * sizeof(unsigned));
-        if (!grown) return 0;
-        mesh->triangles = grown;
+    unsigned *grown = (unsigned *)disti_grow(mesh->owner, mesh->triangles, mesh->triangle_count,
+                                             &mesh->triangle_capacity, 3 * sizeof(unsigned));
+    if (!grown) return 0;
+    mesh->triangles = grown;
+    grown += 3 * mesh->triangle_count++;
+    grown[0] = a;
+    grown[1] = b;
+    grown[2] = c;
+    return 1;
+}
+
+/* 0 after disti_fail if a triangle has a vertex that is not there. */
+static int disti_mesh_check(const dist_mesh *mesh, dist_status status, const char *format, const char *text)
+{
+    for (size_t i = 0; i < 3 * mesh->triangle_count; i++) {
+        if (mesh->triangles[i] < mesh->vertex_count) continue;
+        disti_fail(mesh->owner, status, format, text, (double)mesh->triangles[i], (double)mesh->vertex_count);
+        return 0;
     }
-    unsigned *t = mesh->triangles + 3 * mesh->triangle_count++;
-    t[0] = a;
-    t[1] = b;
-    t[2] = c;
     return 1;
 }
 
 DIST_API dist_mesh *dist_mesh_create(dist_context *ctx, size_t vertex_count, const float *vertices,
                                      size_t triangle_count, const unsigned *triangles)
 {
-    dist_mesh *mesh = NULL;
-    size_t vertex_bytes, triangle_bytes;
     if (disti_enter(ctx, "dist_mesh_create") != DIST_OK) return NULL;
     if ((vertex_count && !vertices) || (triangle_count && !triangles)) {
         disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_create: %s is NULL, but its count is not 0",
                    vertex_count && !vertices ? "vertices" : "triangles", 0, 0);
         return NULL;
     }
-    if (!disti_size_mul(vertex_count, 3 * sizeof(float), &vertex_bytes) ||
-        !disti_size_mul(triangle_count, 3 * sizeof(unsigned), &triangle_bytes)) {
-        disti_fail(ctx, DIST_OUT_OF_MEMORY, "dist_mesh_create: %d vertices and %d triangles do not fit memory", NULL,
-                   (double)vertex_count, (double)triangle_count);
-        return NULL;
+    dist_mesh *mesh = disti_mesh_new(ctx);
+    int good = mesh != NULL;
+    for (size_t i = 0; good && i < vertex_count; i++) {
+        good = disti_finite_all(3, vertices + 3 * i);
+        if (!good) disti_fail(ctx, DIST_NOT_FINITE, "dist_mesh_create: vertex %d is not finite", NULL, (double)i, 0);
+        good = good && disti_mesh_add_vertex(mesh, vertices + 3 * i);
     }
-    for (size_t i = 0; i < vertex_count; i++) {
-        if (disti_finite_all(3, vertices + 3 * i)) continue;
-        disti_fail(ctx, DIST_NOT_FINITE, "dist_mesh_create: vertex %d is not finite", NULL, (double)i, 0);
-        return NULL;
-    }
-    for (size_t i = 0; i < 3 * triangle_count; i++) {
-        if (triangles[i] < vertex_count) continue;
-        disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_create: a triangle has vertex %d, must be below %d", NULL,
-                   (double)triangles[i], (double)vertex_count);
-        return NULL;
-    }
-    mesh = disti_mesh_new(ctx);
-    if (!mesh) return NULL;
-    if (vertex_count) mesh->vertices = (float *)disti_alloc(ctx, vertex_bytes);
-    if (vertex_count && !mesh->vertices) goto fail;
-    mesh->vertex_count = mesh->vertex_capacity = vertex_count;
-    if (triangle_count) mesh->triangles = (unsigned *)disti_alloc(ctx, triangle_bytes);
-    if (triangle_count && !mesh->triangles) goto fail;
-    mesh->triangle_count = mesh->triangle_capacity = triangle_count;
-    if (vertex_count) memcpy(mesh->vertices, vertices, vertex_bytes);
-    if (triangle_count) memcpy(mesh->triangles, triangles, triangle_bytes);
-    return mesh;
-fail:
+    for (size_t i = 0; good && i < triangle_count; i++)
+        good = disti_mesh_add_triangle(mesh, triangles[3 * i], triangles[3 * i + 1], triangles[3 * i + 2]);
+    const char *format = "dist_mesh_create: a triangle has vertex %d, must be below %d";
+    if (good && disti_mesh_check(mesh, DIST_BAD_ARGUMENT, format, NULL)) return mesh;
     dist_mesh_destroy(mesh);
     return NULL;
 }
@@ -10271,24 +10250,29 @@ static int disti_extract_layer(disti_extract *x, size_t z)
     return 1;
 }
 
+/* Nothing is known yet of a corner layer and of what stands on it. */
+static void disti_extract_forget(disti_extract *x, int layer)
+{
+    size_t plane = x->side * x->side;
+    memset(x->known[layer], 0, plane);
+    for (int axis = 0; axis < 2; axis++) memset(x->edge[layer][axis], 0xff, plane * sizeof(unsigned));
+    memset(x->upright, 0xff, plane * sizeof(unsigned));
+}
+
 /* What was the upper corner layer becomes the lower one. */
 static void disti_extract_advance(disti_extract *x)
 {
-    size_t plane = x->side * x->side;
     float *value = x->value[0];
     unsigned char *known = x->known[0];
+    unsigned *edge[2];
+    memcpy(edge, x->edge[0], sizeof edge);
+    memcpy(x->edge[0], x->edge[1], sizeof edge);
+    memcpy(x->edge[1], edge, sizeof edge);
     x->value[0] = x->value[1];
     x->value[1] = value;
     x->known[0] = x->known[1];
     x->known[1] = known;
-    memset(known, 0, plane);
-    for (int axis = 0; axis < 2; axis++) {
-        unsigned *edge = x->edge[0][axis];
-        x->edge[0][axis] = x->edge[1][axis];
-        x->edge[1][axis] = edge;
-        memset(edge, 0xff, plane * sizeof(unsigned));
-    }
-    memset(x->upright, 0xff, plane * sizeof(unsigned));
+    disti_extract_forget(x, 1);
 }
 
 static int disti_extract_surface(disti_extract *x)
@@ -10340,31 +10324,30 @@ static void disti_extract_polish(disti_extract *x, size_t n, int steps, float *v
     }
 }
 
-/* One block of memory for all planes: O(cells^2). The bytes stand last, so that all else is aligned. */
+/* One block for all planes: at most 2049^2 of 30 bytes, and the batch: fits 32 bits. base NULL: only its size. */
+static size_t disti_extract_layout(disti_extract *x, unsigned char *base)
+{
+    size_t at = 0, plane = x->side * x->side;
+    x->batch = (float *)disti_take(base, &at, 15 * DISTI_MESH_BATCH, sizeof(float));
+    x->where = (unsigned *)disti_take(base, &at, DISTI_MESH_BATCH, sizeof(unsigned));
+    for (int layer = 0; layer < 2; layer++) {
+        x->value[layer] = (float *)disti_take(base, &at, plane, sizeof(float));
+        x->known[layer] = (unsigned char *)disti_take(base, &at, plane, 1);
+        for (int axis = 0; axis < 2; axis++)
+            x->edge[layer][axis] = (unsigned *)disti_take(base, &at, plane, sizeof(unsigned));
+    }
+    x->upright = (unsigned *)disti_take(base, &at, plane, sizeof(unsigned));
+    x->active = (unsigned char *)disti_take(base, &at, x->blocks * x->blocks, 1);
+    return at;
+}
+
 static int disti_extract_begin(disti_extract *x)
 {
-    size_t plane = x->side * x->side, blocks = x->blocks * x->blocks; /* at most 2049^2: fit 32 bits */
-    size_t words, bytes;
-    if (!disti_size_mul(plane, 7, &words) || !disti_size_add(words, 16 * DISTI_MESH_BATCH, &words) ||
-        !disti_size_mul(words, 4, &bytes) || !disti_size_add(bytes, 2 * plane + blocks, &bytes))
-        bytes = (size_t)-1;
-    x->memory = disti_alloc(x->ctx, bytes);
-    x->memory_bytes = bytes;
+    x->memory_bytes = disti_extract_layout(x, NULL);
+    x->memory = disti_alloc(x->ctx, x->memory_bytes);
     if (!x->memory) return 0;
-    float *floats = (float *)x->memory;
-    x->batch = floats;
-    x->value[0] = floats + 15 * DISTI_MESH_BATCH;
-    x->value[1] = x->value[0] + plane;
-    unsigned *indices = (unsigned *)x->memory + 15 * DISTI_MESH_BATCH + 2 * plane;
-    x->where = indices;
-    indices += DISTI_MESH_BATCH;
-    for (int i = 0; i < 4; i++) x->edge[i >> 1][i & 1] = indices + (size_t)i * plane;
-    x->upright = indices + 4 * plane;
-    x->known[0] = (unsigned char *)(x->upright + plane);
-    x->known[1] = x->known[0] + plane;
-    x->active = x->known[1] + plane;
-    memset(indices, 0xff, 5 * plane * sizeof(unsigned));
-    memset(x->known[0], 0, 2 * plane);
+    disti_extract_layout(x, (unsigned char *)x->memory);
+    for (int layer = 0; layer < 2; layer++) disti_extract_forget(x, layer);
     return 1;
 }
 
@@ -10481,8 +10464,8 @@ static double disti_triangle_area(const dist_mesh *mesh, size_t i)
         u[k] = (double)mesh->vertices[3 * (size_t)t[1] + (size_t)k] - a;
         v[k] = (double)mesh->vertices[3 * (size_t)t[2] + (size_t)k] - a;
     }
-    for (int k = 0; k < 3; k++) c[k] = u[(k + 1) % 3] * v[(k + 2) % 3] - u[(k + 2) % 3] * v[(k + 1) % 3];
-    return 0.5 * sqrt(c[0] * c[0] + c[1] * c[1] + c[2] * c[2]);
+    disti_cross(u, v, c);
+    return 0.5 * sqrt(disti_dot(c, c));
 }
 
 /* p = (1 - s) a + s (1 - w) b + s w c, s = sqrt(unit), is uniform over the triangle. */
@@ -10507,22 +10490,15 @@ DIST_API dist_status dist_mesh_sample(dist_context *ctx, const dist_mesh *mesh, 
     if (!mesh || (n && !points))
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_sample: %s is NULL", mesh ? "points" : "mesh", 0, 0);
     if (count == 0) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: the mesh has no triangles", name, 0, 0);
+    if (!disti_mesh_check(mesh, DIST_BAD_ARGUMENT, "%s: a triangle has vertex %d, must be below %d", name))
+        return DIST_BAD_ARGUMENT;
     disti_size_mul(count, sizeof(double), &bytes);
     double *until = (double *)disti_alloc(ctx, bytes); /* area of the triangles up to and with this one */
     if (!until) return DIST_OUT_OF_MEMORY;
-    for (size_t i = 0; i < count; i++) {
-        const unsigned *t = mesh->triangles + 3 * i;
-        if (t[0] < mesh->vertex_count && t[1] < mesh->vertex_count && t[2] < mesh->vertex_count) {
-            until[i] = sum += disti_triangle_area(mesh, i);
-        } else {
-            status = disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: triangle %d has a vertex out of range", name, (double)i,
-                                0);
-            goto done;
-        }
-    }
+    for (size_t i = 0; i < count; i++) until[i] = sum += disti_triangle_area(mesh, i);
     if (!disti_finite_double(sum) || !(sum > 0.0)) {
         status = disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: the mesh's area is %d, must be positive", name, sum, 0);
-        goto done;
+        n = 0;
     }
     for (size_t i = 0; i < n; i++) {
         double target = disti_random_unit(&random) * sum;
@@ -10535,7 +10511,6 @@ DIST_API dist_status dist_mesh_sample(dist_context *ctx, const dist_mesh *mesh, 
         double s = sqrt(disti_random_unit(&random));
         disti_mesh_draw(mesh, low, s, disti_random_unit(&random), points + 3 * i);
     }
-done:
     disti_free(ctx, until, bytes);
     return status;
 }
@@ -10639,49 +10614,37 @@ static double disti_box_distance(const float *box, const float *p)
     return sum;
 }
 
+/* Looks for a point of the node nearer to p than *best, squared: its number goes to *hint. The nearer child is first. */
+static void disti_tree_search(const disti_tree *tree, size_t node, size_t low, size_t high, const float *p,
+                              double *best, size_t *hint)
+{
+    if (2 * node + 2 < tree->nodes) {
+        size_t middle = low + (high - low) / 2, child = 2 * node + 1;
+        double left = disti_box_distance(tree->boxes + 6 * child, p);
+        double right = disti_box_distance(tree->boxes + 6 * child + 6, p);
+        for (int k = 0; k < 2; k++) {
+            if ((right < left) == (k == 0)) {
+                if (right < *best) disti_tree_search(tree, child + 1, middle, high, p, best, hint);
+            } else if (left < *best) {
+                disti_tree_search(tree, child, low, middle, p, best, hint);
+            }
+        }
+        return;
+    }
+    for (size_t i = low; i < high; i++) {
+        double d = disti_square_distance(tree->points + 3 * i, p);
+        if (!(d < *best)) continue;
+        *best = d;
+        *hint = i;
+    }
+}
+
 /* Squared distance from p to its nearest point; *hint is a guess at that point, in, and it, out. */
 static double disti_tree_nearest(const disti_tree *tree, const float *p, size_t *hint)
 {
-    struct {
-        double distance;
-        size_t node, low, high;
-    } stack[80];
-    int level, top = 0;
-    size_t node = 0, low = 0, high = tree->n;
-    double best = disti_square_distance(tree->points + 3 * *hint, p), distance = disti_box_distance(tree->boxes, p);
-    for (;;) {
-        while (distance < best && 2 * node + 2 < tree->nodes) {
-            size_t middle = low + (high - low) / 2;
-            double left = disti_box_distance(tree->boxes + 6 * (2 * node + 1), p);
-            double right = disti_box_distance(tree->boxes + 6 * (2 * node + 2), p);
-            int near_right = right < left;
-            double far_distance = near_right ? left : right;
-            if (far_distance < best) {
-                stack[top].distance = far_distance;
-                stack[top].node = 2 * node + (near_right ? 1 : 2);
-                stack[top].low = near_right ? low : middle;
-                stack[top++].high = near_right ? middle : high;
-            }
-            distance = near_right ? right : left;
-            node = 2 * node + (near_right ? 2 : 1);
-            if (near_right) low = middle;
-            else high = middle;
-        }
-        for (size_t i = low; distance < best && i < high; i++) {
-            double d = disti_square_distance(tree->points + 3 * i, p);
-            if (!(d < best)) continue;
-            best = d;
-            *hint = i;
-        }
-        do {
-            if (top == 0) return best;
-            level = --top;
-        } while (!(stack[level].distance < best));
-        distance = stack[level].distance;
-        node = stack[level].node;
-        low = stack[level].low;
-        high = stack[level].high;
-    }
+    double best = disti_square_distance(tree->points + 3 * *hint, p);
+    disti_tree_search(tree, 0, 0, tree->n, p, &best, hint);
+    return best;
 }
 
 typedef struct disti_chamfer_job {
@@ -10753,21 +10716,6 @@ DIST_API dist_status dist_chamfer(dist_context *ctx, size_t n, const float *a, s
 #endif
 
 /*@ 12 files -------------------------------------------------------------------------------------------------------- */
-
-/* Little-endian on every machine. */
-static void disti_sink_word(disti_writer *sink, uint32_t x)
-{
-    unsigned char bytes[4];
-    for (int i = 0; i < 4; i++) bytes[i] = (unsigned char)(x >> 8 * i & 255u);
-    disti_put(sink, bytes, sizeof bytes);
-}
-
-static void disti_sink_float(disti_writer *sink, float x)
-{
-    uint32_t bits;
-    memcpy(&bits, &x, sizeof bits);
-    disti_sink_word(sink, bits);
-}
 
 /* Text at hand while a file in memory is read; it has no terminating 0. */
 typedef struct disti_text {
@@ -10857,14 +10805,12 @@ DIST_API dist_status dist_pfm_write(dist_context *ctx, int width, int height, in
     *size = sink.size + 4 * floats;
     if (!buffer) return DIST_OK;
     if (!pixels) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: pixels is NULL", name, 0, 0);
-    if (capacity < *size)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: capacity is %d, must be %d", name, (double)capacity,
-                          (double)*size);
+    if (capacity < *size) return disti_capacity(ctx, name, capacity, *size);
     memcpy(buffer, header, sink.size);
     sink.out = (unsigned char *)buffer;
     size_t row = (size_t)width * (size_t)channels;
     for (size_t y = (size_t)height; y-- > 0;)
-        for (size_t i = 0; i < row; i++) disti_sink_float(&sink, pixels[y * row + i]);
+        for (size_t i = 0; i < row; i++) disti_put_float(&sink, pixels[y * row + i]);
     return DIST_OK;
 }
 
@@ -10914,8 +10860,12 @@ static dist_status disti_pfm_parse(dist_context *ctx, const char *label, const v
     return DIST_OK;
 }
 
-static void disti_pfm_pixels(const disti_pfm *pfm, float *pixels)
+static void disti_pfm_give(const disti_pfm *pfm, int *width, int *height, int *channels, float *pixels)
 {
+    *width = pfm->width;
+    *height = pfm->height;
+    *channels = pfm->channels;
+    if (!pixels) return;
     size_t row = (size_t)pfm->width * (size_t)pfm->channels;
     const unsigned char *in = pfm->data;
     for (size_t y = (size_t)pfm->height; y-- > 0;)
@@ -10937,13 +10887,8 @@ DIST_API dist_status dist_pfm_read(dist_context *ctx, const void *bytes, size_t 
                           bytes ? "width, height or channels" : "bytes", 0, 0);
     status = disti_pfm_parse(ctx, "in memory", bytes, size, &pfm);
     if (status != DIST_OK) return status;
-    if (pixels && capacity < pfm.floats)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_pfm_read: capacity is %d floats, must be %d", NULL,
-                          (double)capacity, (double)pfm.floats);
-    *width = pfm.width;
-    *height = pfm.height;
-    *channels = pfm.channels;
-    if (pixels) disti_pfm_pixels(&pfm, pixels);
+    if (pixels && capacity < pfm.floats) return disti_capacity(ctx, "dist_pfm_read", capacity, pfm.floats);
+    disti_pfm_give(&pfm, width, height, channels, pixels);
     return DIST_OK;
 }
 
@@ -10962,11 +10907,8 @@ DIST_API dist_status dist_pfm_save(dist_context *ctx, const char *path, int widt
     if (!path || !pixels)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_pfm_save: %s is NULL", path ? "pixels" : "path", 0, 0);
     void *bytes = disti_alloc(ctx, size);
-    if (!bytes) return DIST_OUT_OF_MEMORY;
-    status = dist_pfm_write(ctx, width, height, channels, pixels, bytes, size, &size);
-    if (status == DIST_OK) status = disti_file_write(ctx, "dist_pfm_save", path, bytes, size);
-    disti_free(ctx, bytes, size);
-    return status;
+    if (bytes) status = dist_pfm_write(ctx, width, height, channels, pixels, bytes, size, &size);
+    return disti_file_write(ctx, path, bytes, size, status);
 }
 
 DIST_API float *dist_pfm_load(dist_context *ctx, const char *path, int *width, int *height, int *channels)
@@ -10984,12 +10926,7 @@ DIST_API float *dist_pfm_load(dist_context *ctx, const char *path, int *width, i
     if (!bytes) return NULL;
     if (disti_pfm_parse(ctx, path, bytes, size, &pfm) == DIST_OK)
         pixels = (float *)disti_alloc(ctx, pfm.floats * sizeof(float)); /* fits: as many bytes are in the file */
-    if (pixels) {
-        disti_pfm_pixels(&pfm, pixels);
-        *width = pfm.width;
-        *height = pfm.height;
-        *channels = pfm.channels;
-    }
+    if (pixels) disti_pfm_give(&pfm, width, height, channels, pixels);
     disti_free(ctx, bytes, size);
     return pixels;
 }
@@ -11045,9 +10982,13 @@ typedef struct disti_mesh_text {
     unsigned first, last; /* corners of the polygon that is read: it is fanned from the first */
 } disti_mesh_text;
 
-/* format: %s the label, %d the byte where it happened, then number. */
-static int disti_mesh_fail(const disti_mesh_text *r, dist_status status, const char *format, double number)
+/* what: a sentence in which %d is number. */
+static int disti_mesh_fail(const disti_mesh_text *r, dist_status status, const char *what, double number)
 {
+    char format[160] = "dist_mesh_read (%s): byte %d: ";
+    size_t n = strlen(format);
+    while (*what && n + 1 < sizeof format) format[n++] = *what++;
+    format[n] = 0;
     disti_fail(r->mesh->owner, status, format, r->label, (double)(r->text.at - r->begin), number);
     return 0;
 }
@@ -11057,8 +10998,7 @@ static int disti_mesh_read_vertex(disti_mesh_text *r, const double v[3])
     float p[3];
     for (int k = 0; k < 3; k++) {
         if (!disti_finite_double(v[k]) || fabs(v[k]) > 3.4028235e38)
-            return disti_mesh_fail(r, DIST_NOT_FINITE, "dist_mesh_read (%s): byte %d: vertex %d is not finite",
-                                   (double)r->mesh->vertex_count);
+            return disti_mesh_fail(r, DIST_NOT_FINITE, "vertex %d is not finite", (double)r->mesh->vertex_count);
         p[k] = disti_narrow(v[k]);
     }
     return disti_mesh_add_vertex(r->mesh, p);
@@ -11068,8 +11008,7 @@ static int disti_mesh_read_vertex(disti_mesh_text *r, const double v[3])
 static int disti_mesh_read_corner(disti_mesh_text *r, size_t k, double index)
 {
     if (!(index >= 0.0 && index < 4294967295.0) || index != (double)(unsigned)index)
-        return disti_mesh_fail(r, DIST_BAD_FILE,
-                               "dist_mesh_read (%s): byte %d: a face has vertex %d, which is out of range", index);
+        return disti_mesh_fail(r, DIST_BAD_FILE, "a face has vertex %d, which is out of range", index);
     unsigned corner = (unsigned)index;
     if (k == 0) r->first = corner;
     if (k >= 2 && !disti_mesh_add_triangle(r->mesh, r->first, r->last, corner)) return 0;
@@ -11088,8 +11027,7 @@ static int disti_read_obj(disti_mesh_text *r)
         for (int k = 0; !face && k < 3; k++) {
             disti_skip_blank(t);
             if (!disti_text_number(t, v + k))
-                return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): byte %d: a vertex must be three numbers",
-                                       0);
+                return disti_mesh_fail(r, DIST_BAD_FILE, "a vertex must be three numbers", 0);
         }
         if (!face && !disti_mesh_read_vertex(r, v)) return 0;
         for (size_t k = 0; face; k++) {
@@ -11097,13 +11035,13 @@ static int disti_read_obj(disti_mesh_text *r)
             disti_skip_blank(t);
             if (t->at == t->end || *t->at == '\n' || *t->at == '#') break;
             if (!disti_text_integer(t, &i) || i == 0 || (t->at < t->end && *t->at != '/' && !disti_is_space(*t->at)))
-                return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): byte %d: not a corner of a face", 0);
+                return disti_mesh_fail(r, DIST_BAD_FILE, "not a corner of a face", 0);
             while (t->at < t->end && !disti_is_space(*t->at)) t->at++; /* texture and normal */
             if (!disti_mesh_read_corner(r, k, (double)(i > 0 ? i - 1 : i + (int64_t)r->mesh->vertex_count))) return 0;
         }
     }
     if (r->mesh->vertex_count) return 1;
-    return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): neither PLY nor OFF nor an OBJ with vertices", 0);
+    return disti_mesh_fail(r, DIST_BAD_FILE, "neither PLY nor OFF nor an OBJ with vertices", 0);
 }
 
 /* The next number, over line ends and comments. */
@@ -11112,7 +11050,7 @@ static int disti_off_number(disti_mesh_text *r, double *out)
     disti_text *t = &r->text;
     for (disti_skip_space(t); t->at < t->end && *t->at == '#'; disti_skip_space(t)) disti_skip_line(t);
     if (disti_text_number(t, out)) return 1;
-    return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): byte %d: truncated, or not a number", 0);
+    return disti_mesh_fail(r, DIST_BAD_FILE, "truncated, or not a number", 0);
 }
 
 /* What follows the numbers on a line (normals, colors) is left out. */
@@ -11121,7 +11059,7 @@ static int disti_read_off(disti_mesh_text *r)
     double counts[2], v[3], corners, index;
     disti_skip_blank(&r->text);
     if (r->text.end - r->text.at >= 6 && memcmp(r->text.at, "BINARY", 6) == 0)
-        return disti_mesh_fail(r, DIST_UNSUPPORTED, "dist_mesh_read (%s): binary OFF is not supported", 0);
+        return disti_mesh_fail(r, DIST_UNSUPPORTED, "binary OFF is not supported", 0);
     if (!disti_off_number(r, counts) || !disti_off_number(r, counts + 1)) return 0;
     disti_skip_line(&r->text);
     for (double i = 0.0; i < counts[0]; i += 1.0) {
@@ -11182,8 +11120,7 @@ static int disti_ply_property_line(disti_mesh_text *r, disti_ply *ply)
 {
     disti_text *t = &r->text;
     if (ply->element_count == 0 || ply->property_count == DISTI_PLY_PROPERTIES)
-        return disti_mesh_fail(r, DIST_UNSUPPORTED,
-                               "dist_mesh_read (%s): byte %d: a PLY property without an element, or the 129th", 0);
+        return disti_mesh_fail(r, DIST_UNSUPPORTED, "a PLY property without an element, or the 129th", 0);
     disti_ply_element *element = ply->elements + ply->element_count - 1;
     disti_ply_property *p = ply->properties + ply->property_count++;
     int list = disti_ply_word(t, "list");
@@ -11191,7 +11128,7 @@ static int disti_ply_property_line(disti_mesh_text *r, disti_ply *ply)
     p->type = disti_ply_type(t);
     p->role = DISTI_PLY_OTHER;
     if (p->type < 0 || (list && (p->count_type < 0 || p->count_type > 5)))
-        return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): byte %d: not a type of a PLY property", 0);
+        return disti_mesh_fail(r, DIST_BAD_FILE, "not a type of a PLY property", 0);
     const char *axes[3] = {"x", "y", "z"};
     for (int k = 0; !list && element->vertex && k < 3; k++)
         if (disti_ply_word(t, axes[k])) p->role = DISTI_PLY_X + k;
@@ -11205,7 +11142,7 @@ static int disti_ply_element_line(disti_mesh_text *r, disti_ply *ply)
     disti_text *t = &r->text;
     disti_ply_element *element = ply->elements + ply->element_count;
     if (ply->element_count == DISTI_PLY_ELEMENTS)
-        return disti_mesh_fail(r, DIST_UNSUPPORTED, "dist_mesh_read (%s): byte %d: more than 16 PLY elements", 0);
+        return disti_mesh_fail(r, DIST_UNSUPPORTED, "more than 16 PLY elements", 0);
     ply->element_count++;
     element->vertex = disti_ply_word(t, "vertex");
     element->first = element->last = ply->property_count;
@@ -11213,7 +11150,7 @@ static int disti_ply_element_line(disti_mesh_text *r, disti_ply *ply)
     while (t->at < t->end && !element->vertex && !disti_is_space(*t->at)) t->at++;
     disti_skip_blank(t);
     if (disti_text_integer(t, &element->count) && element->count >= 0) return 1;
-    return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): byte %d: not the count of a PLY element", 0);
+    return disti_mesh_fail(r, DIST_BAD_FILE, "not the count of a PLY element", 0);
 }
 
 static int disti_ply_header(disti_mesh_text *r, disti_ply *ply)
@@ -11227,15 +11164,14 @@ static int disti_ply_header(disti_mesh_text *r, disti_ply *ply)
         } else if (disti_ply_word(t, "format")) {
             ply->ascii = disti_ply_word(t, "ascii");
             if (!ply->ascii && !disti_ply_word(t, "binary_little_endian"))
-                return disti_mesh_fail(r, DIST_UNSUPPORTED,
-                                       "dist_mesh_read (%s): byte %d: PLY must be ascii or binary_little_endian", 0);
+                return disti_mesh_fail(r, DIST_UNSUPPORTED, "PLY must be ascii or binary_little_endian", 0);
         } else if (disti_ply_word(t, "element")) {
             if (!disti_ply_element_line(r, ply)) return 0;
         } else if (disti_ply_word(t, "property")) {
             if (!disti_ply_property_line(r, ply)) return 0;
         }
     }
-    return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): byte %d: the PLY header has no end", 0);
+    return disti_mesh_fail(r, DIST_BAD_FILE, "the PLY header has no end", 0);
 }
 
 static int disti_ply_value(disti_mesh_text *r, const disti_ply *ply, int type, double *out)
@@ -11247,10 +11183,10 @@ static int disti_ply_value(disti_mesh_text *r, const disti_ply *ply, int type, d
     if (ply->ascii) {
         disti_skip_space(t);
         if (disti_text_number(t, out) && (t->at == t->end || disti_is_space(*t->at))) return 1;
-        return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): byte %d: truncated, or not a finite number", 0);
+        return disti_mesh_fail(r, DIST_BAD_FILE, "truncated, or not a finite number", 0);
     }
     if (t->end - t->at < sizes[type])
-        return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): truncated at byte %d", 0);
+        return disti_mesh_fail(r, DIST_BAD_FILE, "truncated", 0);
     for (int i = 0; i < sizes[type]; i++) bits |= (uint64_t)(unsigned char)*t->at++ << 8 * i;
     uint32_t low = (uint32_t)(bits & 0xffffffffu);
     uint64_t sign = (uint64_t)1 << (8 * sizes[type] - 1);
@@ -11271,7 +11207,7 @@ static int disti_ply_skip(disti_mesh_text *r, const disti_ply *ply, int type)
     if (!ply->ascii) return disti_ply_value(r, ply, type, &ignored);
     disti_skip_space(&r->text);
     if (r->text.at == r->text.end)
-        return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): truncated at byte %d", 0);
+        return disti_mesh_fail(r, DIST_BAD_FILE, "truncated", 0);
     while (r->text.at < r->text.end && !disti_is_space(*r->text.at)) r->text.at++;
     return 1;
 }
@@ -11308,7 +11244,7 @@ static int disti_read_ply(disti_mesh_text *r)
         int roles = 0;
         for (int i = element->first; i < element->last; i++) roles |= 1 << ply.properties[i].role;
         if (element->vertex && (roles & 7) != 7)
-            return disti_mesh_fail(r, DIST_BAD_FILE, "dist_mesh_read (%s): the PLY vertices have no x, y and z", 0);
+            return disti_mesh_fail(r, DIST_BAD_FILE, "the PLY vertices have no x, y and z", 0);
         if (roles == 0) continue; /* no properties: no bytes, whatever the count says */
         for (int64_t i = 0; i < element->count; i++)
             if (!disti_ply_item(r, &ply, element)) return 0;
@@ -11335,13 +11271,8 @@ static dist_mesh *disti_mesh_parse(dist_context *ctx, const char *label, const v
         if (off) r.text.at += prefix + 3;
         good = off ? disti_read_off(&r) : disti_read_obj(&r);
     }
-    for (size_t i = 0; good && i < 3 * r.mesh->triangle_count; i++)
-        if (r.mesh->triangles[i] >= r.mesh->vertex_count) {
-            disti_fail(ctx, DIST_BAD_FILE, "dist_mesh_read (%s): a face has vertex %d, must be below %d", label,
-                       (double)r.mesh->triangles[i], (double)r.mesh->vertex_count);
-            good = 0;
-        }
-    if (good) return r.mesh;
+    const char *format = "dist_mesh_read (%s): a face has vertex %d, must be below %d";
+    if (good && disti_mesh_check(r.mesh, DIST_BAD_FILE, format, label)) return r.mesh;
     dist_mesh_destroy(r.mesh);
     return NULL;
 }
@@ -11354,39 +11285,13 @@ DIST_API dist_mesh *dist_mesh_read(dist_context *ctx, const void *bytes, size_t 
     return NULL;
 }
 
-/* Nine significant digits bring every float back; as printf's %.9g writes it, but in no locale. */
+/* Nine significant digits bring every float back. */
 static void disti_sink_decimal(disti_writer *sink, float number)
 {
-    char text[32], digits[9];
-    size_t n = 0;
-    int exponent = 0, last = 8;
+    char text[32];
     uint32_t bits;
     memcpy(&bits, &number, sizeof bits);
-    double x = disti_widen(bits & 0x7fffffffu);
-    if (bits >> 31) text[n++] = '-';
-    for (; x >= 10.0; exponent++) x /= 10.0;
-    for (; x > 0.0 && x < 1.0; exponent--) x *= 10.0;
-    uint64_t mantissa = (uint64_t)(x * 1e8 + 0.5);
-    if (mantissa >= 1000000000u) {
-        mantissa /= 10u;
-        exponent++;
-    }
-    for (int i = 8; i >= 0; i--, mantissa /= 10u) digits[i] = (char)('0' + (int)(mantissa % 10u));
-    while (last > 0 && digits[last] == '0') last--;
-    int plain = exponent > -5 && exponent < 9;
-    int point = plain ? exponent : 0; /* the digit after which the point stands */
-    if (point < 0) {
-        memcpy(text + n, "0.0000", 6);
-        n += (size_t)(1 - point);
-    }
-    for (int i = 0; i <= DISTI_MAX(last, point); i++) {
-        text[n++] = i <= last ? digits[i] : '0';
-        if (i == point && i < last) text[n++] = '.';
-    }
-    disti_put(sink, text, n);
-    if (plain) return;
-    disti_put_text(sink, exponent < 0 ? "e-" : "e");
-    disti_put_size(sink, (size_t)(exponent < 0 ? -exponent : exponent));
+    disti_put(sink, text, disti_format_number(text, disti_widen(bits), 9));
 }
 
 static void disti_write_ply(disti_writer *sink, const dist_mesh *mesh)
@@ -11402,12 +11307,12 @@ static void disti_write_ply(disti_writer *sink, const dist_mesh *mesh)
                     mesh->vertex_count > 0x7fffffffu ? "\nproperty list uchar uint" : "\nproperty list uchar int");
     disti_put_text(sink, " vertex_indices\nend_header\n");
     for (size_t i = 0; i < mesh->vertex_count; i++) {
-        for (size_t k = 0; k < 3; k++) disti_sink_float(sink, mesh->vertices[3 * i + k]);
-        for (size_t k = 0; mesh->normals && k < 3; k++) disti_sink_float(sink, mesh->normals[3 * i + k]);
+        for (size_t k = 0; k < 3; k++) disti_put_float(sink, mesh->vertices[3 * i + k]);
+        for (size_t k = 0; mesh->normals && k < 3; k++) disti_put_float(sink, mesh->normals[3 * i + k]);
     }
     for (size_t i = 0; i < mesh->triangle_count; i++) {
         disti_put(sink, "\003", 1);
-        for (size_t k = 0; k < 3; k++) disti_sink_word(sink, mesh->triangles[3 * i + k]);
+        for (size_t k = 0; k < 3; k++) disti_put_word(sink, mesh->triangles[3 * i + k]);
     }
 }
 
@@ -11462,9 +11367,7 @@ DIST_API dist_status dist_mesh_write(dist_context *ctx, const dist_mesh *mesh, i
         else disti_write_obj(&sink, mesh);
         *size = sink.size;
         if (!buffer) return DIST_OK;
-        if (capacity < *size)
-            return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: capacity is %d, must be %d", name, (double)capacity,
-                              (double)*size);
+        if (capacity < *size) return disti_capacity(ctx, name, capacity, *size);
         sink.out = (unsigned char *)buffer;
         sink.size = 0;
     }
@@ -11474,15 +11377,10 @@ DIST_API dist_status dist_mesh_write(dist_context *ctx, const dist_mesh *mesh, i
 #ifndef DIST_NO_STDIO
 DIST_API dist_mesh *dist_mesh_load(dist_context *ctx, const char *path)
 {
-    size_t size = 0;
+    size_t size;
     if (disti_enter(ctx, "dist_mesh_load") != DIST_OK) return NULL;
-    if (!path) {
-        disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_load: path is NULL", NULL, 0, 0);
-        return NULL;
-    }
     unsigned char *bytes = disti_file_read(ctx, "dist_mesh_load", path, &size);
-    if (!bytes) return NULL;
-    dist_mesh *mesh = disti_mesh_parse(ctx, path, bytes, size);
+    dist_mesh *mesh = bytes ? disti_mesh_parse(ctx, path, bytes, size) : NULL;
     disti_free(ctx, bytes, size);
     return mesh;
 }
@@ -11502,11 +11400,8 @@ DIST_API dist_status dist_mesh_save(dist_context *ctx, const dist_mesh *mesh, co
     status = dist_mesh_write(ctx, mesh, format, NULL, 0, &size);
     if (status != DIST_OK) return status;
     void *bytes = disti_alloc(ctx, size);
-    if (!bytes) return DIST_OUT_OF_MEMORY;
-    status = dist_mesh_write(ctx, mesh, format, bytes, size, &size);
-    if (status == DIST_OK) status = disti_file_write(ctx, "dist_mesh_save", path, bytes, size);
-    disti_free(ctx, bytes, size);
-    return status;
+    if (bytes) status = dist_mesh_write(ctx, mesh, format, bytes, size, &size);
+    return disti_file_write(ctx, path, bytes, size, status);
 }
 #endif
 #endif

@@ -19,6 +19,7 @@ typedef struct scene {
     dist_net *net[2];
     dist_shape *painted;
     dist_field field;
+    float analytic[7];  /* a sphere's code, then a color code */
     dist_scene *placed; /* the shape where the placement says, and once more, out of sight; NULL: it is where it is */
 } scene;
 
@@ -55,8 +56,11 @@ static const double *numbers_of_weights(const scene *s) { return s->numbers + CO
 
 static double distance_at(const scene *s, const double p[3])
 {
-    double q[3];
+    double q[3], square = 0.0;
+    const double *c = s->numbers + CODES;
     to_local(s, p, q);
+    for (int i = 0; i < 3; i++) square += (q[i] - c[i]) * (q[i] - c[i]);
+    if (!s->net[0]) return sqrt(square) - c[3];
     return model_eval(&s->shape, numbers_of_weights(s), s->numbers + CODES, q);
 }
 
@@ -66,6 +70,10 @@ static void color_at(const scene *s, const double p[3], double color[3], double 
     const double *weights = numbers_of_weights(s) + (s->texture.layers ? s->weights : 0);
     double channels[8], q[3];
     to_local(s, p, q);
+    if (closest) *closest = 1e300;
+    for (int i = 0; i < 3 && !s->net[0]; i++)
+        color[i] = 0.5 + 0.3 * sin(3.0 * q[(i + 1) % 3] + s->numbers[CODES + 4 + i]) + 0.1 * s->numbers[CODES + i];
+    if (!s->net[0]) return;
     model_channels(m, weights, s->numbers + CODES, q, channels, NULL, closest);
     memcpy(color, channels + (m->sdf_channel == 0), 3 * sizeof(double));
 }
@@ -94,19 +102,70 @@ static const pair pairs[] = {
     {{.name = "relu channels", .code_size = 2, .channels = "sdf,r,g,b", .width = 16}, {.name = NULL}},
 };
 
-enum { PAIRS = sizeof pairs / sizeof pairs[0] };
+/* As many, and an analytic sphere with c_i = 0.5 + 0.3 sin(3 p_(i+1) + z_i) + 0.1 center_i, by callbacks of our own. */
+enum { PAIRS = sizeof pairs / sizeof pairs[0] + 1 };
+
+static void own_color(void *user, int worker, size_t n, const float *points, float *color)
+{
+    const float *c = (const float *)user;
+    (void)worker;
+    for (size_t i = 0; i < 3 * n; i++)
+        color[i] = 0.5f + 0.3f * sinf(3.0f * points[i / 3 * 3 + (i + 1) % 3] + c[4 + i % 3]) + 0.1f * c[i % 3];
+}
+
+static void own_adjoint(void *user, int worker, size_t n, const float *points, const float *d_color, float *d_points,
+                        double *d_code, double *d_color_code)
+{
+    const float *c = (const float *)user;
+    (void)worker;
+    for (size_t i = 0; i < 3 * n; i++) {
+        size_t at = i / 3 * 3 + (i + 1) % 3;
+        float slope = 0.3f * d_color[i] * cosf(3.0f * points[at] + c[4 + i % 3]);
+        if (d_points) d_points[at] += 3.0f * slope;
+        if (d_code) d_code[i % 3] += 0.1 * (double)d_color[i];
+        if (d_color_code) d_color_code[i % 3] += (double)slope;
+    }
+}
+
+static void scene_look(scene *s)
+{
+    float eye[3] = {1.2f, 0.9f, 1.8f}, at[3] = {0.03f, -0.02f, 0.01f}, up[3] = {0.1f, 1, 0};
+    s->camera = dist_camera_look_at(SIZE, SIZE, 0.9f, eye, at, up);
+    for (int i = 0; i < 3; i++) s->numbers[MOVE + i] = (double)s->camera.translation[i];
+    const float lens[4] = {s->camera.fx, s->camera.fy, s->camera.cx, s->camera.cy};
+    for (int i = 0; i < 4; i++) s->numbers[LENS + i] = (double)lens[i];
+}
+
+static void scene_analytic(scene *s)
+{
+    static const float code[7] = {0.1f, -0.05f, 0.05f, 0.55f, 0.3f, -0.4f, 0.2f};
+    s->name = "analytic sphere";
+    s->code = 4;
+    s->color_code = 3;
+    memcpy(s->analytic, code, sizeof code);
+    for (int i = 0; i < 7; i++) s->numbers[CODES + i] = (double)code[i];
+    s->field = dist_field_sphere(s->analytic);
+    s->field.color_fn = own_color;
+    s->field.color_adjoint_fn = own_adjoint;
+    s->field.color_code_size = 3;
+}
 
 static void scene_open(scene *s, int k, int workers)
 {
     static test_scheduler scheduler;
     dist_context_desc desc = test_context_desc();
     test_random random = test_random_seed(500u + (unsigned)k);
-    float code[2 * MODEL_CODE], eye[3] = {1.2f, 0.9f, 1.8f}, at[3] = {0.03f, -0.02f, 0.01f}, up[3] = {0.1f, 1, 0};
-    const pair *d = &pairs[k];
+    float code[2 * MODEL_CODE];
     memset(s, 0, sizeof *s);
     scheduler.workers = desc.workers = workers;
     desc.scheduler = test_scheduler_hook(&scheduler);
     s->ctx = dist_context_create(&desc);
+    scene_look(s);
+    if (k == PAIRS - 1) {
+        scene_analytic(s);
+        return;
+    }
+    const pair *d = &pairs[k];
     s->name = d->shape.name;
     s->shape = model_make(&d->shape, 70u + (unsigned)k);
     s->code = d->shape.code_size;
@@ -129,10 +188,6 @@ static void scene_open(scene *s, int k, int workers)
     memcpy(weights, s->shape.params, s->shape.count * sizeof(double));
     if (s->texture.layers) memcpy(weights + s->weights, s->texture.params, s->texture.count * sizeof(double));
     s->field = dist_shape_field(s->painted);
-    s->camera = dist_camera_look_at(SIZE, SIZE, 0.9f, eye, at, up);
-    for (int i = 0; i < 3; i++) s->numbers[MOVE + i] = (double)s->camera.translation[i];
-    const float lens[4] = {s->camera.fx, s->camera.fy, s->camera.cx, s->camera.cy};
-    for (int i = 0; i < 4; i++) s->numbers[LENS + i] = (double)lens[i];
     MODEL_CHECK(s->field.color_adjoint_fn != NULL, s->name, dist_context_message(s->ctx), 0, 0);
     CHECK_EQUAL(s->color_code, s->field.color_code_size);
     CHECK_EQUAL(s->color_weights, s->field.color_weight_count);
@@ -164,7 +219,7 @@ static void scene_close(scene *s)
     dist_net_destroy(s->net[0]);
     dist_net_destroy(s->net[1]);
     dist_context_destroy(s->ctx);
-    model_free(&s->shape);
+    if (s->shape.layers) model_free(&s->shape);
     if (s->texture.layers) model_free(&s->texture);
 }
 
@@ -180,7 +235,7 @@ static dist_gradients gradients_of(const scene *s, float *g)
     grads.principal = g + LENS + 2;
     if (s->code) grads.code = g + CODES;
     if (s->color_code) grads.color_code = g + CODES + s->code;
-    grads.weights = g + CODES + s->code + s->color_code;
+    if (s->weights) grads.weights = g + CODES + s->code + s->color_code;
     if (s->color_weights) grads.color_weights = grads.weights + s->weights;
     return grads;
 }
@@ -375,7 +430,8 @@ static void pixels_choose(const scene *s, pictures *a, image_job *job)
         }
         double t = hit_near(s, i, (double)a->distance[i], p, v);
         to_local(s, p, q);
-        model_channels(&s->shape, numbers_of_weights(s), s->numbers + CODES, q, NULL, NULL, &closest[0]);
+        closest[0] = 1e300;
+        if (s->net[0]) model_channels(&s->shape, numbers_of_weights(s), s->numbers + CODES, q, NULL, NULL, &closest[0]);
         color_at(s, p, color, &closest[1]);
         for (int j = 0; j < 3; j++) {
             double moved[3] = {p[0], p[1], p[2]}, d;
@@ -575,6 +631,42 @@ TEST(codes_of_a_textured_shape_are_set_one_by_one)
     scene_close(&t);
 }
 
+TEST(memory_refused_to_a_texture_leaves_the_shape_as_it_was)
+{
+    model m = model_make(&pairs[0].shape, 70u), t = model_make(&pairs[0].texture, 90u);
+    for (size_t at = 1;; at++) {
+        test_allocator a;
+        dist_context_desc desc = test_context_desc();
+        float point[3] = {0.2f, 0.1f, 0.3f}, before, after;
+        memset(&a, 0, sizeof a);
+        desc.allocator = test_allocator_hook(&a);
+        dist_context *ctx = dist_context_create(&desc);
+        dist_net *net = model_load(ctx, &m), *texture = model_load(ctx, &t);
+        dist_shape *shape = dist_shape_create(ctx, net, NULL);
+        dist_field field = dist_shape_field(shape);
+        dist_field_eval(ctx, &field, 1, point, &before, NULL);
+        a.fail_at = a.requests + at;
+        dist_status status = dist_shape_set_texture(shape, texture, NULL);
+        a.fail_at = 0;
+        field = dist_shape_field(shape);
+        dist_field_eval(ctx, &field, 1, point, &after, NULL);
+        CHECK_BYTES(sizeof before, &before, &after);
+        CHECK((field.color_fn != NULL) == (status == DIST_OK));
+        if (status != DIST_OK) CHECK_STATUS(DIST_OUT_OF_MEMORY, status, ctx);
+        dist_shape_destroy(shape);
+        dist_net_destroy(net);
+        dist_net_destroy(texture);
+        dist_context_destroy(ctx);
+        CHECK_EQUAL(0, a.live_blocks);
+        if (status == DIST_OK) {
+            CHECK(at > 3);
+            break;
+        }
+    }
+    model_free(&m);
+    model_free(&t);
+}
+
 TEST(a_texture_that_does_not_fit_and_gradients_that_are_not_there_are_refused)
 {
     static pictures a;
@@ -761,6 +853,7 @@ int main(int argc, char **argv)
     RUN(color_gradients_have_the_same_bits_for_every_number_of_workers_and_whatever_else_is_wanted);
     RUN(color_queries_are_counted_and_none_made_where_no_color_is_asked_for);
     RUN(codes_of_a_textured_shape_are_set_one_by_one);
+    RUN(memory_refused_to_a_texture_leaves_the_shape_as_it_was);
     RUN(a_texture_that_does_not_fit_and_gradients_that_are_not_there_are_refused);
     RUN(a_texture_net_is_created_saved_and_trained);
     RUN(spot_with_its_texture_has_the_reference_colors);

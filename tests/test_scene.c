@@ -828,6 +828,77 @@ TEST(a_placement_is_found_from_a_picture_alone_and_with_the_code)
     dist_context_destroy(ctx);
 }
 
+/* A picture's gradient goes to the instance that is seen; moving it is moving the camera the other way. */
+TEST(a_pixel_pulls_on_the_instance_that_it_shows_alone)
+{
+    enum { W = 48, N = W * W };
+    static float depth[N], d_depth[N];
+    static unsigned char mask[N];
+    dist_context *ctx = test_context();
+    float ball[4] = {0, 0, 0, 0.5f}, box[6] = {0, 0, 0, 0.4f, 0.3f, 0.5f}, d_code[24], d_translation[3];
+    dist_field fields[2] = {dist_field_sphere(ball), dist_field_box(box)};
+    dist_instance two[2];
+    memset(two, 0, sizeof two);
+    for (int k = 0; k < 2; k++) {
+        float move[7] = {0.1f, 0.3f, -0.2f, 0.4f, k ? 0.8f : -0.8f, 0, 0};
+        two[k].field = &fields[k];
+        dist_similarity_move(&two[k].placement, move);
+    }
+    dist_scene *scene = dist_scene_create(ctx, 2, two);
+    dist_field field = dist_scene_field(scene);
+    dist_camera camera = camera_for(&field, W);
+    dist_tape *tape = dist_tape_create(ctx, &camera, NULL);
+    dist_images out, d_out;
+    memset(&out, 0, sizeof out);
+    memset(&d_out, 0, sizeof d_out);
+    out.depth = depth;
+    out.mask = mask;
+    d_out.depth = d_depth;
+    CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, tape), ctx);
+    for (int shown = 0; shown < 2; shown++) {
+        dist_gradients grads;
+        int count = 0;
+        memset(&grads, 0, sizeof grads);
+        memset(d_code, 0, sizeof d_code);
+        memset(d_translation, 0, sizeof d_translation);
+        grads.code = d_code;
+        grads.translation = d_translation;
+        for (int i = 0; i < N; i++) {
+            float o[3], d[3], p[3];
+            int index = -1;
+            d_depth[i] = 0;
+            if (!mask[i]) continue;
+            dist_camera_ray(&camera, (float)(i % W), (float)(i / W), o, d);
+            float along = camera.rotation[6] * d[0] + camera.rotation[7] * d[1] + camera.rotation[8] * d[2];
+            for (int k = 0; k < 3; k++) p[k] = o[k] + depth[i] / along * d[k];
+            CHECK_STATUS(DIST_OK, dist_scene_find(scene, 1, p, &index), ctx);
+            if (index != shown) continue;
+            d_depth[i] = 1.0f;
+            count++;
+        }
+        CHECK(count > 20);
+        CHECK_STATUS(DIST_OK, dist_render_backward(ctx, tape, &d_out, &grads), ctx);
+        int end[3] = {0, dist_scene_offset(scene, 1), dist_scene_offset(scene, 2)};
+        double there = 0, turned[3] = {0, 0, 0};
+        for (int j = 0; j < end[2]; j++) {
+            int mine = j >= end[shown] && j < end[shown + 1];
+            if (!mine) CHECK_NEAR(0, d_code[j], 0);
+            else there = fmax(there, fabs((double)d_code[j]));
+        }
+        CHECK(there > 1);
+        for (int i = 0; i < 3; i++) /* x_cam = R x + t: an instance moved by R^T dt is the camera's t moved by dt */
+            for (int k = 0; k < 3; k++)
+                turned[i] += (double)camera.rotation[3 * i + k] * (double)d_code[end[shown + 1] - 3 + k];
+        turned[0] -= (double)d_translation[0];
+        turned[1] -= (double)d_translation[1];
+        turned[2] -= (double)d_translation[2];
+        for (int i = 0; i < 3; i++) CHECK_NEAR(0, turned[i], 1e-3 * count);
+    }
+    dist_tape_destroy(tape);
+    dist_scene_destroy(scene);
+    dist_context_destroy(ctx);
+}
+
 /* ---- the door ---------------------------------------------------------------------------------------------------- */
 
 TEST(moving_a_placement_keeps_it_a_similarity)
@@ -1075,6 +1146,7 @@ int main(int argc, char **argv)
     RUN(twenty_instances_cost_a_query_no_more_than_one_and_a_fifth);
     RUN(a_scene_has_the_same_bits_for_any_number_of_threads);
     RUN(a_placement_is_found_from_a_picture_alone_and_with_the_code);
+    RUN(a_pixel_pulls_on_the_instance_that_it_shows_alone);
     RUN(moving_a_placement_keeps_it_a_similarity);
     RUN(scenes_refuse_what_cannot_be_placed);
     RUN(what_is_not_finite_stays_so);

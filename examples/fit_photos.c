@@ -4,6 +4,7 @@
    cc -O2 examples/fit_photos.c -lm -o fit_photos && ./fit_photos --out out/photos */
 #define DIST_IMPLEMENTATION
 #include "../dist.h"
+#define COMMON_TEXTURE
 #include "common.h"
 #include "fit.h"
 #include "raster.h"
@@ -17,18 +18,25 @@ static const char usage[] =
     "                     x_cam = R x + t, x right, y down, z forward, pixel centers at integers, # a comment;\n"
     "                     the shape stands in the unit sphere around 0. Neighbors in the file should be in space\n"
     "  --save DIR         writes the photos that were taken in that form\n"
+    "  --texture FILE     what the shape is painted with: the word embedded (default with the embedded model), or\n"
+    "                     waves (default without it), a pattern in space\n"
+    "  --color-code N     which of the texture's colorings (default 0)\n"
     "  --views N          photos taken (default 24)\n"
     "  --size WxH         of each (default 112x112)\n"
     "  --background WHICH sky (default, a pattern far away) or plain\n"
     "  --batch N          photos a step (default 8)\n"
     "  --start WHICH      random:SEED (default random:1), zero, mean, INDEX or FILE: the code to begin with\n"
-    "  --iterations N     steps of Adam (default 96)\n"
+    "  --iterations N     steps of Adam (default 64)\n"
     "  --rate R           its rate (default 0.01)\n"
     "  --weights P,C      of the photometric loss and the code prior (default 5,1)\n"
     "  --ssim S           share of structural similarity in the loss, 0 to 1 (default 0)\n"
     "  --blur B           photos are blurred by so many pixels at first, sharp after half of the steps (default 4)\n"
     "  --gradient WHICH   auto (default), implicit, normal, paper, or mesh: the baseline, through a mesh's depth\n"
     "  --mesh-cells N     of that mesh's grid (default 48)\n"
+    "  --similarity       scale, rotation and translation of the shape are found as well\n"
+    "  --off P,D,T        photos taken: it starts P percent too large or small, turned by D degrees, moved by T\n"
+    "                     (default 10,10,0.1)\n"
+    "  --place S,X,Y,Z    photos read: the scale and place it starts with (default 1,0,0,0)\n"
     "  --trials N         fits from random:1 to random:N, and how many end at a third of the start's Chamfer or less\n"
     "  --threads N        threads to use at most (default all)\n"
     "  --out STEM         files written: STEM.png, STEM_loss.svg, STEM.ply, STEM.json\n";
@@ -36,9 +44,9 @@ static const char usage[] =
 enum { GRADIENT_MESH = 4, NEIGHBORS = 2, SHOWN = 4, SCORE_POINTS = 10000 };
 
 typedef struct request {
-    const char *model, *target, *photos, *save, *start, *out;
-    int width, height, views, batch, iterations, trials, plain, gradient, cells;
-    float rate, weights[2], ssim, blur;
+    const char *model, *target, *texture, *photos, *save, *start, *out;
+    int width, height, views, batch, iterations, trials, plain, gradient, cells, color_code, similarity;
+    float rate, weights[2], ssim, blur, off[3], place[4];
     dist_context_desc settings;
 } request;
 
@@ -54,18 +62,42 @@ typedef struct view_data {
     int used; /* in this step */
 } view_data;
 
+/* What is looked for. */
+typedef struct state {
+    float *code;
+    dist_similarity place; /* of the shape in the world */
+} state;
+
 typedef struct fit {
     const request *asked;
     dist_context *ctx;
     dist_shape *shape;
-    dist_field field;
+    dist_scene *scene; /* with --similarity: the shape in its place */
+    dist_field field;  /* of the scene or of the shape */
     size_t code_size, view_count;
     view_data *views;
-    float *code, *d_code;
+    state now;
+    float *d_code; /* and of the placement: code_size + 7 */
     float *target_points; /* on the true surface; NULL: not known */
     dist_render_desc how;
     unsigned long long queries;
 } fit;
+
+/* Makes f->field the shape of this code in this place. */
+static void fit_set(fit *f, const state *s)
+{
+    dist_shape_set_code(f->shape, s->code);
+    f->field = dist_shape_field(f->shape);
+    if (f->scene) {
+        dist_field field = f->field;
+        dist_instance instance;
+        instance.field = &field;
+        instance.placement = s->place;
+        dist_scene_set(f->scene, 0, &instance);
+        f->field = dist_scene_field(f->scene);
+    }
+    check(f->ctx);
+}
 
 static size_t pixel_count(const view_data *v)
 {
@@ -87,8 +119,8 @@ static void paint(const float p[3], float color[3])
     }
 }
 
-/* A picture of the field as a camera takes it: in the model's own colors if it has any. */
-static void take_photo(fit *f, view_data *v)
+/* A picture of the field as a camera takes it: in its own colors if it has any. */
+static void take_photo(fit *f, const dist_field *field, view_data *v)
 {
     size_t n = pixel_count(v);
     size_t width = (size_t)v->camera.width;
@@ -96,8 +128,8 @@ static void take_photo(fit *f, view_data *v)
     memset(&out, 0, sizeof out);
     out.distance = take_floats(n);
     out.mask = (unsigned char *)take(n, 1);
-    out.color = f->field.color_fn ? v->photo : NULL;
-    dist_render(f->ctx, &f->field, &v->camera, NULL, &out, NULL);
+    out.color = field->color_fn ? v->photo : NULL;
+    dist_render(f->ctx, field, &v->camera, NULL, &out, NULL);
     check(f->ctx);
     for (size_t i = 0; i < n; i++) {
         float origin[3];
@@ -129,7 +161,7 @@ static void view_take(fit *f, view_data *v)
 }
 
 /* Cameras around the shape, higher and lower by turns so that more of it is seen than from one height. */
-static void take_photos(fit *f)
+static void take_photos(fit *f, const dist_field *field)
 {
     const request *o = f->asked;
     f->view_count = (size_t)o->views;
@@ -144,7 +176,7 @@ static void take_photos(fit *f)
         look.fov = 45.0f;
         f->views[i].camera = view_camera(&look, turn);
         view_take(f, &f->views[i]);
-        take_photo(f, &f->views[i]);
+        take_photo(f, field, &f->views[i]);
     }
 }
 
@@ -394,10 +426,10 @@ static double fit_loss(fit *f, int count, int (*pairs)[2], double terms[2])
     dist_mesh *mesh = NULL;
     memset(&desc, 0, sizeof desc);
     desc.ssim = o->ssim;
-    memset(f->d_code, 0, f->code_size * sizeof(float));
+    memset(f->d_code, 0, (f->code_size + 7) * sizeof(float));
     for (size_t i = 0; i < f->view_count; i++) { f->views[i].used = 0; }
     for (int k = 0; k < count; k++) { f->views[pairs[k][0]].used = f->views[pairs[k][1]].used = 1; }
-    dist_shape_set_code(f->shape, f->code);
+    fit_set(f, &f->now);
     if (o->gradient == GRADIENT_MESH) {
         dist_mesh_desc how;
         memset(&how, 0, sizeof how);
@@ -416,7 +448,7 @@ static double fit_loss(fit *f, int count, int (*pairs)[2], double terms[2])
     }
     views_backward(f, mesh);
     dist_mesh_destroy(mesh);
-    terms[1] = (double)dist_loss_code(f->code_size, f->code, o->weights[1] / (float)f->code_size, f->d_code);
+    terms[1] = (double)dist_loss_code(f->code_size, f->now.code, o->weights[1] / (float)f->code_size, f->d_code);
     return terms[0] + terms[1];
 }
 
@@ -433,10 +465,15 @@ static void blur_photos(fit *f, float sigma)
 static void fit_run(fit *f, double *loss)
 {
     const request *o = f->asked;
+    float moments[14] = {0};
     dist_adam adam;
+    dist_adam mover;
     memset(&adam, 0, sizeof adam);
+    memset(&mover, 0, sizeof mover);
     adam.rate = o->rate;
     adam.moments = take_floats(2 * f->code_size);
+    mover.rate = 0.5f * o->rate;
+    mover.moments = moments;
     int(*pairs)[2] = (int(*)[2])take(f->view_count, sizeof *pairs);
     progress p = progress_begin("fitting");
     int stage = -1;
@@ -446,7 +483,12 @@ static void fit_run(fit *f, double *loss)
         stage = now;
         int count = choose_pairs(f, i, pairs);
         loss[3 * i] = fit_loss(f, count, pairs, loss + 3 * i + 1);
-        dist_adam_step(&adam, f->code_size, f->code, f->d_code);
+        dist_adam_step(&adam, f->code_size, f->now.code, f->d_code);
+        if (f->scene) {
+            float step[7] = {0};
+            dist_adam_step(&mover, 7, step, f->d_code + f->code_size);
+            dist_similarity_move(&f->now.place, step);
+        }
         progress_show(&p, i + 1, o->iterations, "loss", loss[3 * i]);
     }
     progress_end(&p);
@@ -486,10 +528,42 @@ static score fit_score(fit *f)
     return s;
 }
 
+/* How far the placement is from the true one, which is none: percent of scale, degrees, distance. */
+static void place_error(const dist_similarity *s, float error[3])
+{
+    float cosine = 0.5f * (s->rotation[0] + s->rotation[4] + s->rotation[8] - 1.0f);
+    const float *t = s->translation;
+    error[0] = 100.0f * fabsf(s->scale - 1.0f);
+    error[1] = acosf(cosine > 1.0f ? 1.0f : cosine < -1.0f ? -1.0f : cosine) * 180.0f / PI;
+    error[2] = sqrtf(t[0] * t[0] + t[1] * t[1] + t[2] * t[2]);
+}
+
+/* Where a fit starts: as the user says; or, with photos that were taken, off by chance. */
+static dist_similarity start_place(const request *o, int trial)
+{
+    rng r = rng_begin(1000u + (unsigned)trial);
+    dist_similarity place;
+    float step[7];
+    float axis[6];
+    memset(&place, 0, sizeof place);
+    for (int k = 0; k < 6; k++) { axis[k] = rng_normal(&r); }
+    float turn = o->off[1] * PI / 180.0f / sqrtf(axis[0] * axis[0] + axis[1] * axis[1] + axis[2] * axis[2]);
+    float shift = o->off[2] / sqrtf(axis[3] * axis[3] + axis[4] * axis[4] + axis[5] * axis[5]);
+    step[0] = logf(1.0f + (rng_uniform(&r) < 0.5f ? -0.01f : 0.01f) * o->off[0]);
+    for (int k = 0; k < 6; k++) { step[1 + k] = axis[k] * (k < 3 ? turn : shift); }
+    if (o->photos || !o->similarity) {
+        memset(step, 0, sizeof step);
+        step[0] = logf(o->place[0]);
+        memcpy(step + 4, o->place + 1, 3 * sizeof(float));
+    }
+    dist_similarity_move(&place, step);
+    return place;
+}
+
 /* ---- report ------------------------------------------------------------------------------------------------------ */
 
 /* Four views in a row each: photos, start, result, truth if known, and what the neighbors' photos say is there. */
-static void write_sheet(fit *f, const float *start_code, const float *target_code)
+static void write_sheet(fit *f, const state *start, const state *target)
 {
     enum { ROWS = 5 };
     static const char *const names[ROWS] = {"photo", "start", "result", "truth", "neighbor warped"};
@@ -497,9 +571,8 @@ static void write_sheet(fit *f, const float *start_code, const float *target_cod
     const char *captions[ROWS * SHOWN];
     int count = 0;
     for (int row = 0; row < ROWS; row++) {
-        if (row == 3 && !target_code) { continue; }
-        const float *code = row == 1 ? start_code : row == 3 ? target_code : f->code;
-        dist_shape_set_code(f->shape, code);
+        if (row == 3 && !target->code) { continue; }
+        fit_set(f, row == 1 ? start : row == 3 ? target : &f->now);
         for (int k = 0; k < SHOWN; k++) {
             view_data *v = &f->views[(size_t)k * f->view_count / SHOWN];
             int zoom = picture_zoom(v->camera.width, v->camera.height);
@@ -524,7 +597,7 @@ static void write_sheet(fit *f, const float *start_code, const float *target_cod
     canvas sheet = picture_sheet(count, pictures, captions, SHOWN);
     printf("%s\n", write_canvas(f->asked->out, &sheet));
     for (int i = 0; i < count; i++) { canvas_destroy(&pictures[i]); }
-    dist_shape_set_code(f->shape, f->code);
+    fit_set(f, &f->now);
 }
 
 static void write_loss(const request *o, const double *loss)
@@ -556,6 +629,7 @@ static void write_report(const fit *f, const float *chamfers, int trials, int go
     json j = json_open(path_of(path, o->out, ".json"));
     json_text(&j, "model", o->model);
     json_text(&j, "photos", o->photos ? o->photos : "taken of the model");
+    if (!o->photos) { json_text(&j, "texture", o->texture); }
     for (int i = 0; i < 2; i++) {
         json_number(&j, i ? "loss_end" : "loss_start", scores[i].loss);
         json_score(&j, "chamfer", when[i], scores[i].chamfer);
@@ -574,7 +648,12 @@ static void write_report(const fit *f, const float *chamfers, int trials, int go
     json_number(&j, "ssim", (double)o->ssim);
     json_number(&j, "blur", (double)o->blur);
     json_text(&j, "gradient", o->gradient == GRADIENT_MESH ? "mesh" : gradient_name(o->gradient));
-    json_floats(&j, "code", f->code_size, f->code);
+    if (f->scene) {
+        json_number(&j, "scale", (double)f->now.place.scale);
+        json_floats(&j, "rotation", 9, f->now.place.rotation);
+        json_floats(&j, "translation", 3, f->now.place.translation);
+    }
+    json_floats(&j, "code", f->code_size, f->now.code);
     json_close(&j);
     printf("%s\n", path);
 }
@@ -590,12 +669,15 @@ static request read_options(int argc, char **argv)
     r.width = r.height = 112;
     r.views = 24;
     r.batch = 8;
-    r.iterations = 96;
+    r.iterations = 64;
     r.rate = 0.01f;
     r.weights[0] = 5.0f;
     r.weights[1] = 1.0f;
     r.blur = 4.0f;
     r.cells = 48;
+    r.off[0] = r.off[1] = 10.0f;
+    r.off[2] = 0.1f;
+    r.place[0] = 1.0f;
     options walk = options_begin(argc, argv, usage);
     while (option_next(&walk)) {
         if (option_is_word(&walk) && !r.model) {
@@ -606,6 +688,16 @@ static request read_options(int argc, char **argv)
             r.photos = option_text(&walk);
         } else if (option_is(&walk, "--save")) {
             r.save = option_text(&walk);
+        } else if (option_is(&walk, "--texture")) {
+            r.texture = option_text(&walk);
+        } else if (option_is(&walk, "--color-code")) {
+            r.color_code = option_int(&walk, 0, 1000000);
+        } else if (option_is(&walk, "--similarity")) {
+            r.similarity = option_flag(&walk);
+        } else if (option_is(&walk, "--off")) {
+            option_floats(&walk, 3, r.off);
+        } else if (option_is(&walk, "--place")) {
+            option_floats(&walk, 4, r.place);
         } else if (option_is(&walk, "--views")) {
             r.views = option_int(&walk, 2, 1000);
         } else if (option_is(&walk, "--size")) {
@@ -646,13 +738,42 @@ static request read_options(int argc, char **argv)
     if (r.trials && r.start) { fail("--trials begins from random:1, random:2 ...; leave out --start"); }
     if (r.trials && r.photos) { fail("--trials needs a known shape; leave out --photos"); }
     if (r.weights[0] < 0 || r.weights[1] < 0) { fail("--weights must not be negative"); }
+    if (!(r.off[0] > -99.0f && r.off[0] < 99.0f)) { fail("--off must stay below 99 percent"); }
+    int placed = r.place[0] != 1.0f || r.place[1] != 0.0f || r.place[2] != 0.0f || r.place[3] != 0.0f;
+    if (placed && !(r.photos && r.similarity)) { fail("--place belongs to --photos with --similarity"); }
+    if (!(r.place[0] > 0)) { fail("--place needs a scale above 0"); }
     if (!r.model) { r.model = "embedded"; }
+    if (!r.texture) { r.texture = strcmp(r.model, "embedded") == 0 ? "embedded" : "waves"; }
     if (!r.target) { r.target = "0"; }
     check_stem(r.out);
     return r;
 }
 
-static fit fit_create(const request *o, dist_net *net, dist_context *ctx, const float *target)
+/* Photos of the target and points on its surface. */
+static void observe(fit *f, const dist_net *net, const float *code)
+{
+    const request *o = f->asked;
+    dist_shape *truth = dist_shape_create(f->ctx, net, code);
+    dist_net *texture = strcmp(o->texture, "waves") == 0 ? NULL : load_texture(f->ctx, o->texture);
+    if (texture) {
+        if ((size_t)dist_net_code_size(texture) < f->code_size) {
+            fail("%s is the texture of another model", o->texture);
+        }
+        if (o->color_code >= dist_net_code_count(texture)) {
+            fail("--color-code is %d; %s has %d colorings", o->color_code, o->texture, dist_net_code_count(texture));
+        }
+        dist_shape_set_texture(truth, texture, dist_net_code(texture, o->color_code) + f->code_size);
+    }
+    check(f->ctx);
+    dist_field field = dist_shape_field(truth);
+    take_photos(f, &field);
+    dist_mesh_destroy(surface_of(f->ctx, &field, &f->target_points));
+    if (!f->target_points) { fail("the target has no surface"); }
+    dist_shape_destroy(truth);
+    dist_net_destroy(texture);
+}
+
+static fit fit_create(const request *o, const dist_net *net, dist_context *ctx, const float *target)
 {
     fit f;
     memset(&f, 0, sizeof f);
@@ -660,17 +781,21 @@ static fit fit_create(const request *o, dist_net *net, dist_context *ctx, const 
     f.ctx = ctx;
     f.code_size = (size_t)dist_net_code_size(net);
     if (f.code_size == 0) { fail("%s has no code, so there is nothing to fit", o->model); }
-    f.d_code = take_floats(f.code_size);
+    f.d_code = take_floats(f.code_size + 7);
     f.how.gradient = o->gradient == GRADIENT_MESH ? DIST_GRADIENT_AUTO : o->gradient;
-    f.shape = dist_shape_create(ctx, net, target);
+    f.shape = dist_shape_create(ctx, net, NULL);
     f.field = dist_shape_field(f.shape);
+    if (o->similarity) {
+        dist_instance instance;
+        memset(&instance, 0, sizeof instance);
+        instance.field = &f.field;
+        f.scene = dist_scene_create(ctx, 1, &instance);
+    }
     check(ctx);
     if (o->photos) {
         read_photos(&f);
     } else {
-        take_photos(&f);
-        dist_mesh_destroy(surface_of(ctx, &f.field, &f.target_points));
-        if (!f.target_points) { fail("the target has no surface"); }
+        observe(&f, net, target);
     }
     if (o->save) { save_photos(&f); }
     find_neighbors(&f);
@@ -690,9 +815,28 @@ static void fit_destroy(fit *f)
         dist_tape_destroy(v->tape);
     }
     free(f->views);
+    free(f->now.code);
     free(f->d_code);
     free(f->target_points);
+    dist_scene_destroy(f->scene);
     dist_shape_destroy(f->shape);
+}
+
+static void print_result(const fit *f, const char *name, const score scores[2], const state *start, double seconds)
+{
+    printf("%s: loss %.4f -> %.4f", name, scores[0].loss, scores[1].loss);
+    if (f->target_points) {
+        printf("  Chamfer (x 1000, truth to shape) %.3f -> %.3f", 1000 * scores[0].chamfer, 1000 * scores[1].chamfer);
+    }
+    if (f->scene && f->target_points) {
+        float error[2][3];
+        place_error(&start->place, error[0]);
+        place_error(&f->now.place, error[1]);
+        printf("  scale %.1f -> %.1f %%, turn %.1f -> %.1f deg, place %.3f -> %.3f", (double)error[0][0],
+               (double)error[1][0], (double)error[0][1], (double)error[1][1], (double)error[0][2], (double)error[1][2]);
+    }
+    printf("  %.1f s\n", seconds);
+    fflush(stdout);
 }
 
 int main(int argc, char **argv)
@@ -700,43 +844,43 @@ int main(int argc, char **argv)
     request r = read_options(argc, argv);
     dist_context *ctx = dist_context_create(&r.settings);
     dist_net *net = load_model(ctx, r.model);
-    float *target = r.photos ? NULL : choose_code(net, r.target);
-    fit f = fit_create(&r, net, ctx, target);
+    state target;
+    state start;
+    memset(&target, 0, sizeof target);
+    memset(&start, 0, sizeof start);
+    target.code = r.photos ? NULL : choose_code(net, r.target);
+    fit f = fit_create(&r, net, ctx, target.code);
     double *loss = (double *)take(3 * (size_t)r.iterations, sizeof(double));
     int trials = r.trials ? r.trials : 1;
     int good = 0;
     float *chamfers = take_floats(2 * (size_t)trials); /* of the starts, of the ends; below 0: none */
-    float *start = NULL;
     score scores[2];
     double seconds = 0;
     for (int t = 0; t < trials; t++) {
         char text[64];
         snprintf(text, sizeof text, "random:%d", t + 1);
-        free(f.code);
-        free(start);
-        start = choose_code(net, r.start ? r.start : text);
-        f.code = choose_code(net, r.start ? r.start : text);
+        const char *name = r.start ? r.start : text;
+        free(f.now.code);
+        free(start.code);
+        start.code = choose_code(net, name);
+        start.place = start_place(&r, t);
+        f.now.code = choose_code(net, name);
+        f.now.place = start.place;
         scores[0] = fit_score(&f);
-        f.queries = 0;
+        unsigned long long scored = f.queries;
         double begin = seconds_now();
         fit_run(&f, loss);
         seconds = seconds_now() - begin;
-        unsigned long long queries = f.queries;
+        unsigned long long queries = f.queries - scored;
         scores[1] = fit_score(&f);
         f.queries = queries;
         chamfers[t] = (float)scores[0].chamfer;
         chamfers[trials + t] = (float)scores[1].chamfer;
         good += scores[0].chamfer > 0 && scores[1].chamfer >= 0 && 3 * scores[1].chamfer <= scores[0].chamfer;
-        printf("%s: loss %.4f -> %.4f", r.start ? r.start : text, scores[0].loss, scores[1].loss);
-        if (f.target_points) {
-            printf("  Chamfer (x 1000, truth to shape) %.3f -> %.3f", 1000 * scores[0].chamfer,
-                   1000 * scores[1].chamfer);
-        }
-        printf("  %.1f s\n", seconds);
-        fflush(stdout);
+        print_result(&f, name, scores, &start, seconds);
     }
     if (r.trials) { printf("%d of %d end at a third of the start's Chamfer or less\n", good, trials); }
-    write_sheet(&f, start, target);
+    write_sheet(&f, &start, &target);
     write_loss(&r, loss);
     write_report(&f, chamfers, trials, good, scores, seconds);
 
@@ -746,9 +890,8 @@ int main(int argc, char **argv)
     check(ctx);
     printf("%s\n", path);
     dist_mesh_destroy(mesh);
-    free(f.code);
-    free(start);
-    free(target);
+    free(start.code);
+    free(target.code);
     free(chamfers);
     free(loss);
     fit_destroy(&f);

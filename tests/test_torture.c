@@ -1,0 +1,613 @@
+/* SPDX-License-Identifier: MIT-0
+   Random scenes, from ordinary to absurd, through render and backward: fields and nets with weights up to extreme,
+   cameras, settings, sizes. Whatever comes, nothing that is not finite is written, no budget is exceeded, every status
+   is true, and one worker and three give the same bits.
+
+       build/test_torture            300 scenes; DIST_TEST_QUICK=1: 60
+       DIST_TORTURE=20000 build/test_torture    that many, and a csv line for each check (make torture)
+       DIST_TORTURE_SCENE=17 build/test_torture     only that one */
+#include "shapes.h"
+
+enum { MOST = 2048 }; /* pixels of a scene */
+
+typedef struct planes {
+    float depth[MOST], distance[MOST], normal[3 * MOST], silhouette[MOST], error[MOST];
+    unsigned char mask[MOST], status[MOST];
+    dist_stats stats;
+} planes;
+
+enum { CODE_MOST = 8, WEIGHTS_MOST = 20000 };
+
+typedef struct pulls {
+    float code[CODE_MOST], rotation[3], translation[3], focal[2], principal[2], weights[WEIGHTS_MOST];
+} pulls;
+
+static planes first, second;
+static pulls pull_first, pull_second;
+static float d_plane[6 * MOST];
+static unsigned char wanted[MOST];
+
+/* What was found wrong, by kind. */
+enum { REFUSED, NOT_FINITE, OVER_BUDGET, COUNTS, FALSE_HIT, FALSE_MISS, BAD_BOUND, THREADS, GRADIENT, MEMORY, KINDS };
+static const char *const kind_names[KINDS] = {"refused without a sentence", "written, but not finite", "over the budget",
+                                              "counts do not add up", "hits that are none", "misses that are none",
+                                              "farther off than the bound", "bits differ between 1 and 3 workers",
+                                              "gradient not finite", "memory taken while rendering"};
+static long found[KINDS], hits_judged, misses_judged, bounds_judged, refusals, scenes;
+static unsigned long scene_now;
+
+/* The first of each kind in a scene is printed. */
+static void note(int kind, const char *what, double a, double b)
+{
+    static unsigned long last[KINDS];
+    found[kind]++;
+    if (last[kind] == scene_now) return;
+    last[kind] = scene_now;
+    if (found[kind] <= 6 || test_state.verbose)
+        printf("    scene %lu: %s: %s %.9g %.9g\n", scene_now, kind_names[kind], what, a, b);
+}
+
+/* ---- fields ----------------------------------------------------------------------------------------------------- */
+
+enum { WILD_NONE, WILD_HASH, WILD_STAIRS, WILD_HUGE, WILD_TINY, WILD_SPIKES };
+
+/* A shape moved to a center, scaled, and made wild. With a code: code[0] is added to the value, code[1] times x. */
+typedef struct scene_field {
+    test_shape shape;
+    double center[3], scale;
+    int wild;
+    float code[2];
+    long points;
+} scene_field;
+
+static double hash_of(const double p[3])
+{
+    uint64_t bits[3], h = 1469598103934665603u;
+    memcpy(bits, p, sizeof bits);
+    for (int i = 0; i < 3; i++) h = (h ^ bits[i]) * 1099511628211u;
+    test_random r = test_random_seed(h);
+    return test_random_double(&r, -1, 1);
+}
+
+static double scene_value(const scene_field *f, const double p[3])
+{
+    double q[3];
+    for (int i = 0; i < 3; i++) q[i] = (p[i] - f->center[i]) / f->scale;
+    double v = f->scale * shape_value(&f->shape, q);
+    switch (f->wild) {
+    case WILD_HASH: v = hash_of(p) * f->scale; break;
+    case WILD_STAIRS: v = floor(v / f->scale * 7) / 7 * f->scale; break;
+    case WILD_HUGE: v *= 1e34; break;
+    case WILD_TINY: v *= 1e-38; break;
+    case WILD_SPIKES: v = hash_of(p) > 0.9 ? (hash_of(p) > 0.95 ? 3e38 : -3e38) : v; break;
+    }
+    return v + (double)f->code[0] + (double)f->code[1] * q[0];
+}
+
+static float narrow(double x)
+{
+    return x > 3.4e38 ? 3.4e38f : x < -3.4e38 ? -3.4e38f : (float)x;
+}
+
+static void scene_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    scene_field *f = (scene_field *)user;
+    (void)worker;
+    f->points += (long)n;
+    for (size_t i = 0; i < n; i++) {
+        double p[3];
+        for (size_t k = 0; k < 3; k++) p[k] = (double)points[3 * i + k];
+        sdf[i] = narrow(scene_value(f, p));
+        if (f->shape.poison > 0 && hash_of(p) > 0.8) {
+            uint32_t bits = hash_of(p) > 0.9 ? 0x7fc00000u : 0x7f800000u;
+            memcpy(sdf + i, &bits, sizeof bits);
+        }
+        for (size_t k = 0; gradient && k < 3; k++) {
+            double a[3] = {p[0], p[1], p[2]}, b[3] = {p[0], p[1], p[2]}, h = 1e-6 * (f->scale + fabs(p[k]));
+            a[k] += h;
+            b[k] -= h;
+            gradient[3 * i + k] = narrow((scene_value(f, a) - scene_value(f, b)) / (2 * h));
+        }
+    }
+}
+
+static void scene_adjoint(void *user, int worker, size_t n, const float *points, const float *d_sdf, double *d_code)
+{
+    const scene_field *f = (const scene_field *)user;
+    (void)worker;
+    for (size_t i = 0; i < n; i++) {
+        d_code[0] += (double)d_sdf[i];
+        d_code[1] += (double)d_sdf[i] * ((double)points[3 * i] - f->center[0]) / f->scale;
+    }
+}
+
+/* ---- a scene ---------------------------------------------------------------------------------------------------- */
+
+typedef struct scene {
+    scene_field own;
+    int is_net, sane; /* sane: the Lipschitz figure holds, so that misses can be judged */
+    dist_net_desc net;
+    double weight_scale, code_scale;
+    int extreme; /* of the weights */
+    dist_camera camera;
+    dist_render_desc how;
+    int planes; /* a bit for each plane asked for */
+    double radius, lipschitz, clamp, center[3];
+} scene;
+
+static double log_uniform(test_random *r, double low, double high)
+{
+    return pow(10, test_random_double(r, low, high));
+}
+
+static int one_in(test_random *r, int n)
+{
+    return test_random_int(r, 1, n) == 1;
+}
+
+static test_shape random_shape(test_random *r)
+{
+    switch (test_random_int(r, 0, 8)) {
+    case 0: return shape_make(SHAPE_SPHERE, test_random_double(r, 0.01, 0.95), 0, 0, 0);
+    case 1: return shape_make(SHAPE_TORUS, test_random_double(r, 0.2, 0.6), log_uniform(r, -4, -0.6), 0, 0);
+    case 2: return shape_make(SHAPE_BOX, log_uniform(r, -5, -0.3), test_random_double(r, 0.1, 0.5), log_uniform(r, -5, -0.3), 0);
+    case 3: {
+        double z = test_random_double(r, -1, 1), s = sqrt(1 - z * z);
+        return shape_make(SHAPE_PLANE, s, 0, z, test_random_double(r, -0.8, 0.8));
+    }
+    case 4: return shape_make(SHAPE_RODS, log_uniform(r, -5, -1), 0, 0, 0);
+    case 5: return shape_make(SHAPE_SHELLS, log_uniform(r, -6, -1.2), 0, 0, 0);
+    case 6: return shape_make(SHAPE_BUMPY, 0.6, log_uniform(r, -4, -0.8), log_uniform(r, 0, 3), 0);
+    case 7: return shape_make(SHAPE_CONSTANT, (one_in(r, 2) ? 1 : -1) * (one_in(r, 4) ? 0 : log_uniform(r, -9, 1)), 0, 0, 0);
+    default: return shape_make(SHAPE_PAIR, log_uniform(r, -7, -1), log_uniform(r, -7, -1), 0, 0);
+    }
+}
+
+static void random_field(test_random *r, scene *s)
+{
+    scene_field *f = &s->own;
+    f->shape = random_shape(r);
+    f->scale = one_in(r, 3) ? log_uniform(r, -6, 6) : 1;
+    if (one_in(r, 3))
+        for (int i = 0; i < 3; i++) s->center[i] = (double)(float)(f->scale * test_random_double(r, -3, 3));
+    memcpy(f->center, s->center, sizeof f->center);
+    s->radius = f->scale;
+    double bumps = f->shape.kind == SHAPE_BUMPY ? 1 + f->shape.n[1] * f->shape.n[2] * 1.5 : 1;
+    s->lipschitz = bumps;
+    s->sane = bumps < 3;
+    if (one_in(r, 3)) { /* a slope that the figure knows of, or not */
+        f->shape.slope = log_uniform(r, -2, 3);
+        if (one_in(r, 2)) s->lipschitz = bumps * fmax(1, f->shape.slope);
+        else s->sane = s->sane && f->shape.slope <= 1;
+    }
+    if (one_in(r, 4)) {
+        f->shape.clamp = log_uniform(r, -2, 0);
+        s->clamp = f->shape.clamp * f->scale;
+    }
+    if (one_in(r, 10)) f->shape.squash = log_uniform(r, -1, 3), s->sane = 0;
+    if (one_in(r, 12)) f->shape.power = one_in(r, 2) ? 3 : -1, s->sane = 0;
+    if (one_in(r, 12)) f->shape.poison = 1, s->sane = 0;
+    if (one_in(r, 10)) f->wild = test_random_int(r, 1, 5), s->sane = 0;
+    if (s->sane && one_in(r, 2)) s->lipschitz *= test_random_double(r, 1, 3);
+    if (one_in(r, 8)) s->lipschitz = log_uniform(r, -6, 6), s->sane = 0;
+    if (one_in(r, 10)) f->code[0] = test_random_float(r, -0.1f, 0.1f) * (float)f->scale;
+}
+
+static void random_net(test_random *r, scene *s)
+{
+    s->is_net = 1;
+    s->net.layers = test_random_int(r, 1, 5);
+    s->net.width = test_random_int(r, 1, 48);
+    s->net.skip = s->net.layers > 1 && one_in(r, 3) ? test_random_int(r, 1, s->net.layers - 1) : 0;
+    s->net.code_size = one_in(r, 3) ? 0 : test_random_int(r, 1, CODE_MOST);
+    s->net.activation = test_random_int(r, DIST_ACTIVATION_RELU, DIST_ACTIVATION_NONE);
+    s->net.output_linear = one_in(r, 2);
+    s->net.geometric = (s->net.activation == DIST_ACTIVATION_RELU || s->net.activation == DIST_ACTIVATION_SOFTPLUS) && one_in(r, 2);
+    s->net.seed = (unsigned)test_random_int(r, 1, 1000000);
+    s->weight_scale = one_in(r, 3) ? log_uniform(r, -40, 38) : one_in(r, 2) ? log_uniform(r, -1, 2) : 1;
+    s->code_scale = one_in(r, 3) ? log_uniform(r, -40, 38) : 0.1;
+    s->extreme = one_in(r, 4) ? test_random_int(r, 1, 4) : 0;
+    s->radius = 1;
+    s->lipschitz = one_in(r, 3) ? log_uniform(r, -2, 3) : 1;
+    s->net.bound = one_in(r, 3) ? (float)log_uniform(r, -2, 2) : 0;
+    if (s->net.bound > 0) s->radius = (double)s->net.bound;
+}
+
+static void random_camera(test_random *r, scene *s)
+{
+    int kind = test_random_int(r, 0, 9), width = test_random_int(r, 1, 40), height = test_random_int(r, 1, 40);
+    if (one_in(r, 12)) width = test_random_int(r, 500, 1500), height = 1;
+    float eye[3], at[3], up[3];
+    double away = kind < 6 ? test_random_double(r, 1.5, 4) : kind < 7 ? log_uniform(r, -6, 0) : log_uniform(r, 0, 6);
+    float v[3];
+    test_random_direction(r, v);
+    test_random_direction(r, up);
+    for (int i = 0; i < 3; i++) {
+        eye[i] = (float)(s->center[i] + s->radius * away * (double)v[i]);
+        at[i] = (float)(s->center[i] + s->radius * test_random_double(r, -0.2, 0.2));
+    }
+    double fov = kind < 8 ? 2.2 / fmax(away, 1) : log_uniform(r, -4, 0.47);
+    s->camera = dist_camera_look_at(width, height, (float)fov, eye, at, up);
+    if (one_in(r, 6)) {
+        s->camera.fx *= (float)log_uniform(r, -1, 1);
+        s->camera.skew = (float)test_random_double(r, -0.5, 0.5) * s->camera.fx;
+        s->camera.cx += (float)test_random_double(r, -1, 1) * (float)width;
+        s->camera.pixel_center = 0.5f;
+    }
+    if (one_in(r, 12)) {
+        s->camera.fx = (float)log_uniform(r, -3, 6);
+        s->camera.fy = one_in(r, 4) ? -(float)log_uniform(r, -3, 6) : (float)log_uniform(r, -3, 6);
+    }
+    if (one_in(r, 12))
+        for (int i = 0; i < 9; i++) s->camera.rotation[i] += test_random_float(r, -2e-4f, 2e-4f);
+}
+
+static void random_how(test_random *r, scene *s)
+{
+    dist_render_desc *how = &s->how;
+    how->trace = one_in(r, 3) ? DIST_TRACE_PAPER : DIST_TRACE_GUARDED;
+    how->paper_row = test_random_int(r, 0, 3);
+    how->max_steps = one_in(r, 3) ? test_random_int(r, 1, 300) : 0;
+    how->step_scale = one_in(r, 5) ? (float)log_uniform(r, -3, 2) : 0;
+    how->epsilon = one_in(r, 4) ? (float)(log_uniform(r, -12, -0.5) * s->radius) : 0;
+    how->samples = test_random_int(r, 0, 8);
+    how->gradient = test_random_int(r, 0, DIST_GRADIENT_PAPER);
+    how->gradient_cap = one_in(r, 3) ? (float)log_uniform(r, -9, 0) : 0;
+    how->normal_mode = test_random_int(r, 0, 1);
+    how->normal_delta = one_in(r, 3) ? (float)(log_uniform(r, -8, 0) * s->radius) : 0;
+    how->normal_space = test_random_int(r, 0, 1);
+    how->inside = test_random_int(r, 0, 2);
+    how->background = one_in(r, 3) ? (float)log_uniform(r, -6, 11) : 0;
+    how->no_cones = one_in(r, 4);
+    how->no_prediction = one_in(r, 4);
+    if (one_in(r, 4))
+        how->max_queries = (unsigned long long)(log_uniform(r, -1, 2) * s->camera.width * s->camera.height);
+    if (one_in(r, 6)) {
+        int dense = test_random_int(r, 1, 20);
+        for (int i = 0; i < MOST; i++) wanted[i] = (unsigned char)one_in(r, dense);
+        how->pixels = wanted;
+    }
+    s->planes = test_random_int(r, 0, 127) | (one_in(r, 2) ? 127 : 0);
+}
+
+static void random_scene(unsigned long seed, scene *s)
+{
+    test_random r = test_random_seed(seed * 2654435761u + 1);
+    memset(s, 0, sizeof *s);
+    if (one_in(&r, 3)) random_net(&r, s);
+    else random_field(&r, s);
+    random_camera(&r, s);
+    random_how(&r, s);
+}
+
+/* ---- rendering it ----------------------------------------------------------------------------------------------- */
+
+typedef struct stage { /* one context and what lives in it */
+    test_allocator memory;
+    test_scheduler scheduler;
+    dist_context *ctx;
+} stage;
+
+static stage stages[2];
+
+static int stage_open(stage *s, int workers)
+{
+    dist_context_desc desc = test_context_desc();
+    memset(s, 0, sizeof *s);
+    s->scheduler.workers = workers;
+    desc.workers = workers;
+    desc.allocator = test_allocator_hook(&s->memory);
+    if (workers > 1) desc.scheduler = test_scheduler_hook(&s->scheduler);
+    s->ctx = dist_context_create(&desc);
+    return CHECK_STATUS(DIST_OK, dist_context_status(s->ctx), s->ctx);
+}
+
+/* Extreme weights: 1: one of them 1e30; 2: some denormal; 3: a zero layer; 4: one the largest float. */
+static void spoil_weights(const scene *s, size_t n, float *w)
+{
+    test_random r = test_random_seed(s->net.seed);
+    for (size_t i = 0; i < n; i++) w[i] = narrow((double)w[i] * s->weight_scale);
+    size_t at = (size_t)test_random_int(&r, 0, (int)n - 1);
+    if (s->extreme == 1) w[at] = 1e30f;
+    if (s->extreme == 2)
+        for (size_t i = at; i < n; i += 3) w[i] = (float)(1e-40 * (double)test_random_int(&r, -9, 9));
+    if (s->extreme == 3) memset(w + at, 0, (n - at < 200 ? n - at : 200) * sizeof *w);
+    if (s->extreme == 4) w[at] = -3.4e38f;
+}
+
+static dist_shape *make_shape(dist_context *ctx, const scene *s, dist_net **net)
+{
+    static float w[WEIGHTS_MOST];
+    float code[CODE_MOST] = {0};
+    test_random r = test_random_seed(s->net.seed + 1u);
+    *net = dist_net_create(ctx, &s->net);
+    size_t n = dist_net_weight_count(*net);
+    if (!*net || n > WEIGHTS_MOST) return NULL;
+    memcpy(w, dist_net_weights(*net), n * sizeof *w);
+    spoil_weights(s, n, w);
+    if (dist_net_set_weights(ctx, *net, w) != DIST_OK) return NULL;
+    for (int i = 0; i < CODE_MOST; i++) code[i] = narrow(s->code_scale * test_random_double(&r, -1, 1));
+    return dist_shape_create(ctx, *net, code);
+}
+
+static int all_finite(size_t n, const float *x)
+{
+    for (size_t i = 0; i < n; i++)
+        if (!test_finite((double)x[i])) return 0;
+    return 1;
+}
+
+static dist_images planes_of(planes *p, int which)
+{
+    dist_images out;
+    memset(p, 0x5a, sizeof *p);
+    memset(&p->stats, 0, sizeof p->stats);
+    memset(&out, 0, sizeof out);
+    out.distance = p->distance;
+    out.mask = p->mask;
+    out.status = p->status;
+    out.error = p->error;
+    out.stats = &p->stats;
+    if (which & 1) out.depth = p->depth;
+    if (which & 2) out.normal = p->normal;
+    if (which & 4) out.silhouette = p->silhouette;
+    return out;
+}
+
+/* 1 if it was rendered, 0 if it was refused. The field is as the last stage made it, for the judges. */
+static int scene_render(const scene *s, stage *where, planes *p, pulls *g, scene_field *own)
+{
+    dist_context *ctx = where->ctx;
+    dist_net *net = NULL;
+    dist_shape *shape = NULL;
+    dist_field field;
+    size_t n = (size_t)s->camera.width * (size_t)s->camera.height;
+    memset(g, 0, sizeof *g);
+    dist_context_clear(ctx);
+    if (s->is_net) {
+        shape = make_shape(ctx, s, &net);
+        field = dist_shape_field(shape);
+    } else {
+        *own = s->own;
+        memset(&field, 0, sizeof field);
+        field.user = own;
+        field.eval_fn = scene_eval;
+        field.adjoint_fn = scene_adjoint;
+        field.code_size = 2;
+        field.radius = (float)s->radius;
+        field.clamp = (float)s->clamp;
+        for (int i = 0; i < 3; i++) field.center[i] = (float)s->center[i];
+    }
+    if (!s->is_net || (scene_now & 1)) field.lipschitz = (float)s->lipschitz;
+    dist_tape *tape = s->planes & 64 ? NULL : dist_tape_create(ctx, &s->camera, &s->how);
+    dist_images out = planes_of(p, s->planes);
+    size_t requests = where->memory.requests;
+    dist_status status = dist_render(ctx, &field, &s->camera, &s->how, &out, tape);
+    if (status == DIST_OK && tape) {
+        dist_gradients grads;
+        dist_images d_out;
+        memset(&grads, 0, sizeof grads);
+        memset(&d_out, 0, sizeof d_out);
+        grads.code = field.code_size ? g->code : NULL;
+        grads.rotation = g->rotation;
+        grads.translation = g->translation;
+        grads.focal = g->focal;
+        grads.principal = g->principal;
+        if (s->is_net && s->planes & 32 && field.weight_count <= WEIGHTS_MOST) grads.weights = g->weights;
+        test_random r = test_random_seed(scene_now);
+        double scale = one_in(&r, 4) ? log_uniform(&r, -30, 30) : 1;
+        for (size_t i = 0; i < 6 * n; i++) d_plane[i] = narrow(scale * test_random_double(&r, -1, 1));
+        d_out.depth = out.depth ? d_plane : NULL;
+        d_out.distance = d_plane + n;
+        d_out.silhouette = out.silhouette ? d_plane + 2 * n : NULL;
+        d_out.normal = out.normal ? d_plane + 3 * n : NULL;
+        d_out.stats = &p->stats;
+        status = dist_render_backward(ctx, tape, &d_out, &grads);
+        if (!all_finite(CODE_MOST, g->code)) note(GRADIENT, "code, scale", scale, s->is_net);
+        if (!all_finite(10, g->rotation)) note(GRADIENT, "camera, scale", scale, s->is_net);
+        if (!all_finite(WEIGHTS_MOST, g->weights)) note(GRADIENT, "weights, scale", scale, s->is_net);
+    }
+    if (where->memory.requests != requests) note(MEMORY, "requests", (double)requests, (double)where->memory.requests);
+    if (status != DIST_OK && !strstr(dist_context_message(ctx), ": ")) note(REFUSED, "status", status, 0);
+    dist_tape_destroy(tape);
+    dist_shape_destroy(shape);
+    dist_net_destroy(net);
+    return status == DIST_OK;
+}
+
+/* ---- judging it ------------------------------------------------------------------------------------------------- */
+
+static void judge_counts(const scene *s, const planes *p, const scene_field *own)
+{
+    unsigned long long seen[8] = {0}, hits = 0, rays = 0;
+    size_t n = (size_t)s->camera.width * (size_t)s->camera.height;
+    const dist_stats *t = &p->stats;
+    int steps = dist_render_desc_resolve(&s->how).max_steps;
+    for (size_t i = 0; i < n; i++) {
+        if (p->status[i] > DIST_RAY_SKIPPED) note(COUNTS, "status", p->status[i], 0);
+        seen[p->status[i] & 7]++;
+        rays += p->status[i] != DIST_RAY_SKIPPED;
+        hits += p->mask[i];
+        int hit = p->status[i] == DIST_RAY_HIT || (p->status[i] == DIST_RAY_INSIDE && s->how.inside == DIST_INSIDE_HIT);
+        if (p->mask[i] != hit) note(COUNTS, "mask", p->mask[i], p->status[i]);
+        if (s->planes & 4 && rays && p->status[i] != DIST_RAY_SKIPPED && (p->silhouette[i] < 0) != p->mask[i] &&
+            s->how.trace == DIST_TRACE_GUARDED)
+            note(COUNTS, "sign of the silhouette", (double)p->silhouette[i], p->mask[i]);
+    }
+    if (rays != t->rays || hits != t->hits) note(COUNTS, "rays, hits", (double)t->rays, (double)t->hits);
+    if (seen[DIST_RAY_UNRESOLVED] != t->unresolved || seen[DIST_RAY_INSIDE] != t->inside ||
+        seen[DIST_RAY_PLATEAU] != t->plateau || seen[DIST_RAY_NOT_FINITE] != t->not_finite)
+        note(COUNTS, "statuses", (double)t->unresolved, (double)seen[DIST_RAY_UNRESOLVED]);
+    if (t->queries != t->cone_queries + t->march_queries + t->refine_queries + t->silhouette_queries + t->normal_queries)
+        note(COUNTS, "queries", (double)t->queries, (double)t->march_queries);
+    if (!s->is_net && s->planes & 64 && (unsigned long long)own->points != t->queries)
+        note(COUNTS, "points", (double)t->queries, (double)own->points);
+    /* the tiles' borders are traced twice; 66: the most a bracket and a prediction may add; cones: 64 rounds each */
+    double traced = 1.15 * (double)n + 70;
+    double budget = traced * (steps + 46) + (double)(n / 16 + 8) * 2 * 64;
+    if (s->planes & 4) budget += 8.0 * (double)(n / 16 + 80) + 7.0 * (double)n;
+    if (s->planes & 2) budget += 6.0 * (double)n;
+    if ((double)t->queries > budget) note(OVER_BUDGET, "queries", (double)t->queries, budget);
+    if (s->how.max_queries && t->queries > s->how.max_queries)
+        note(OVER_BUDGET, "max_queries", (double)t->queries, (double)s->how.max_queries);
+}
+
+static void judge_finite(const scene *s, const planes *p)
+{
+    size_t n = (size_t)s->camera.width * (size_t)s->camera.height;
+    if (!all_finite(n, p->distance)) note(NOT_FINITE, "distance", 0, 0);
+    if (!all_finite(n, p->error)) note(NOT_FINITE, "error", 0, 0);
+    if (s->planes & 1 && !all_finite(n, p->depth)) note(NOT_FINITE, "depth", 0, 0);
+    if (s->planes & 2 && !all_finite(3 * n, p->normal)) note(NOT_FINITE, "normal", 0, 0);
+    if (s->planes & 4 && !all_finite(n, p->silhouette)) note(NOT_FINITE, "silhouette", 0, 0);
+    for (size_t i = 0; i < n; i++)
+        if (p->error[i] < 0) note(NOT_FINITE, "negative error", (double)p->error[i], p->status[i]);
+    if (!test_finite((double)p->stats.error) || !test_finite((double)p->stats.epsilon))
+        note(NOT_FINITE, "stats", (double)p->stats.error, (double)p->stats.epsilon);
+}
+
+/* f along the ray of one pixel, in double but for the point, which is a float's at the library as well. */
+static double value_at(const scene_field *f, const double o[3], const double d[3], double t)
+{
+    double p[3] = {o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]};
+    return scene_value(f, p);
+}
+
+/* Hits: f is small there, or changes sign within the error. The surface's slope is known, so f small is judged by it.
+   Misses, where the figure holds: no crossing deeper than rounding. */
+static void judge_truth(const scene *s, const planes *p, const scene_field *own)
+{
+    double slope = (own->shape.slope > 0 ? own->shape.slope : 1) * (own->shape.kind == SHAPE_BUMPY ? 1 + 1.5 * own->shape.n[1] * own->shape.n[2] : 1);
+    int paper = s->how.trace == DIST_TRACE_PAPER, n = s->camera.width * s->camera.height;
+    int coarse = paper && s->how.paper_row == DIST_PAPER_COARSE_TO_FINE; /* its hits may be its parents' */
+    double away = 0;
+    for (int i = 0; i < n; i++) {
+        double o[3], d[3], c[3], t0 = 0, t1 = 0;
+        if (p->status[i] == DIST_RAY_SKIPPED) continue;
+        shape_pixel(&s->camera, i % s->camera.width, i / s->camera.width, o, d);
+        for (int k = 0; k < 3; k++) c[k] = o[k] - s->center[k];
+        away = fmax(away, shape_length(c[0], c[1], c[2]));
+        int meets = shape_enter(c, d, s->radius, &t0, &t1);
+        double t = (double)p->distance[i], rounding = 3e-7 * (fabs(t) + s->radius + fabs(s->center[0]) + fabs(s->center[1]) + fabs(s->center[2]));
+        double epsilon = s->how.epsilon > 0 ? (double)s->how.epsilon : 5e-5 * s->radius;
+        epsilon = fmax(epsilon, 5e-7 * s->radius);
+        if (p->status[i] == DIST_RAY_HIT && !coarse && own->wild != WILD_HASH && own->wild != WILD_SPIKES && !(own->shape.poison > 0)) {
+            double e = (double)p->error[i] + rounding;
+            double a = value_at(own, o, d, t - e), m = value_at(own, o, d, t), b = value_at(own, o, d, t + e);
+            double small = epsilon * (paper ? 1 + slope : 1.01) + 2 * slope * rounding;
+            if (own->wild == WILD_HUGE) small *= 1e34;
+            hits_judged++;
+            int good = (a > 0) != (b > 0) || fabs(m) <= small;
+            for (int k = 0; k < 64 && !good; k++) {
+                m = value_at(own, o, d, t - e + 2 * e * k / 63);
+                good = m <= small && m >= -small - 2 * slope * e;
+            }
+            int thin = rounding > 1e-4 * s->radius && own->shape.power < 0; /* a plate may lie between two samples */
+            if (!good && !thin)
+                note(FALSE_HIT, "f, error", m, (double)p->error[i]);
+        }
+        if (p->status[i] == DIST_RAY_INSIDE && own->wild == WILD_NONE && !(own->shape.poison > 0)) {
+            double f = value_at(own, o, d, meets ? t0 : 0);
+            hits_judged++;
+            if (f > 4 * slope * rounding && !paper) note(FALSE_HIT, "inside, f", f, rounding);
+        }
+        if (p->status[i] != DIST_RAY_MISS && p->status[i] != DIST_RAY_UNRESOLVED) continue;
+        if (!s->sane || paper || own->code[0] != 0 || !meets) continue;
+        double q[3] = {c[0] / s->radius, c[1] / s->radius, c[2] / s->radius};
+        double bumps = own->shape.kind == SHAPE_BUMPY ? 3 : 1;
+        shape_crossing x = shape_cross(&own->shape, q, d, t0 / s->radius, t1 / s->radius, bumps, 1e-4, 1e-4);
+        double deep = rounding / s->radius * 6;
+        if (!x.crosses || x.below < deep || x.t * s->radius - t0 < 2 * rounding) continue;
+        if (p->status[i] == DIST_RAY_MISS) {
+            misses_judged++;
+            note(FALSE_MISS, "deep, at", x.below, x.t);
+        } else {
+            bounds_judged++;
+            double e = (double)p->error[i] + 4 * rounding;
+            int nearer = value_at(own, o, d, t - e) * value_at(own, o, d, t + e) <= 0; /* than the judge's steps see */
+            if (fabs(x.t * s->radius - t) > e && !nearer) note(BAD_BOUND, "off, error", fabs(x.t * s->radius - t), (double)p->error[i]);
+        }
+    }
+}
+
+static unsigned long number_of(const char *name, unsigned long otherwise)
+{
+    const char *text = getenv(name);
+    return text && text[0] ? strtoul(text, NULL, 10) : otherwise;
+}
+
+static void describe(const scene *s)
+{
+    const test_shape *f = &s->own.shape;
+    const dist_render_desc *h = &s->how;
+    if (s->is_net)
+        printf("    net: layers %d, width %d, skip %d, code %d, activation %d, linear %d, geometric %d, weights %g, "
+               "code %g, extreme %d, bound %g, lipschitz %g\n",
+               s->net.layers, s->net.width, s->net.skip, s->net.code_size, s->net.activation, s->net.output_linear,
+               s->net.geometric, s->weight_scale, s->code_scale, s->extreme, (double)s->net.bound, s->lipschitz);
+    else
+        printf("    shape %d (%g %g %g %g), scale %g, slope %g, clamp %g, squash %g, power %g, poison %g, wild %d, "
+               "moved %g, radius %g, lipschitz %g, sane %d, center %g %g %g\n",
+               f->kind, f->n[0], f->n[1], f->n[2], f->n[3], s->own.scale, f->slope, f->clamp, f->squash, f->power,
+               f->poison, s->own.wild, (double)s->own.code[0], s->radius, s->lipschitz, s->sane, s->center[0],
+               s->center[1], s->center[2]);
+    printf("    camera %d x %d, f %g %g, c %g %g, skew %g, t %g %g %g\n", s->camera.width, s->camera.height,
+           (double)s->camera.fx, (double)s->camera.fy, (double)s->camera.cx, (double)s->camera.cy,
+           (double)s->camera.skew, (double)s->camera.translation[0], (double)s->camera.translation[1],
+           (double)s->camera.translation[2]);
+    printf("    trace %d, row %d, steps %d, alpha %g, epsilon %g, samples %d, gradient %d, cap %g, normals %d %g, "
+           "inside %d, no_cones %d, no_prediction %d, max_queries %llu, pixels %d, planes %d\n",
+           h->trace, h->paper_row, h->max_steps, (double)h->step_scale, (double)h->epsilon, h->samples, h->gradient,
+           (double)h->gradient_cap, h->normal_mode, (double)h->normal_delta, h->inside, h->no_cones, h->no_prediction,
+           h->max_queries, h->pixels != NULL, s->planes);
+}
+
+static void one_scene(unsigned long seed)
+{
+    scene s;
+    scene_field own;
+    scene_now = seed;
+    random_scene(seed, &s);
+    if (number_of("DIST_TORTURE_SCENE", 0)) describe(&s);
+    memset(&own, 0, sizeof own);
+    scenes++;
+    int done = scene_render(&s, &stages[0], &first, &pull_first, &own);
+    int again = scene_render(&s, &stages[1], &second, &pull_second, &own);
+    if (done != again) note(THREADS, "refused by one", done, again);
+    if (!done) {
+        refusals++;
+        if (test_state.verbose) printf("    scene %lu: %s\n", seed, dist_context_message(stages[0].ctx));
+        return;
+    }
+    if (memcmp(&first, &second, sizeof first) != 0) note(THREADS, "planes", 0, 0);
+    if (memcmp(&pull_first, &pull_second, sizeof pull_first) != 0) note(THREADS, "gradients", 0, 0);
+    judge_finite(&s, &first);
+    judge_counts(&s, &second, &own);
+    if (!s.is_net) judge_truth(&s, &first, &own);
+}
+
+TEST(random_scenes_keep_their_word)
+{
+    unsigned long count = number_of("DIST_TORTURE", test_quick() ? 60 : 300), only = number_of("DIST_TORTURE_SCENE", 0);
+    if (!stage_open(&stages[0], 1) || !stage_open(&stages[1], 3)) return;
+    for (unsigned long i = only ? only : 1; i <= (only ? only : count); i++) one_scene(i);
+    for (int k = 0; k < KINDS; k++) {
+        CHECK_EQUAL(0, found[k]);
+        if (getenv("DIST_TORTURE")) printf("scenes,%s,0,%ld\n", kind_names[k], found[k]);
+    }
+    CHECK((unsigned long)refusals * 5 <= count);
+    if (test_state.verbose || getenv("DIST_TORTURE"))
+        printf("scenes,run / refused / hits judged,,%ld / %ld / %ld\n", scenes, refusals, hits_judged);
+    for (int k = 0; k < 2; k++) {
+        dist_context_destroy(stages[k].ctx);
+        CHECK_EQUAL(0, stages[k].memory.live_blocks);
+        CHECK_EQUAL(0, stages[k].memory.errors);
+    }
+}
+
+int main(int argc, char **argv)
+{
+    test_begin(argc, argv);
+    RUN(random_scenes_keep_their_word);
+    return test_report();
+}

@@ -797,6 +797,14 @@ static int disti_finite(float x)
     return (bits & 0x7f800000u) != 0x7f800000u;
 }
 
+/* Not finite, or above 2^56: a sum of products of such numbers may overflow. */
+DISTI_UNUSED static unsigned char disti_is_huge(float x)
+{
+    uint32_t bits;
+    memcpy(&bits, &x, sizeof bits);
+    return (bits & 0x7fffffffu) >= 0x5b800000u;
+}
+
 DISTI_UNUSED static int disti_finite_all(size_t n, const float *x)
 {
     for (size_t i = 0; i < n; i++)
@@ -809,6 +817,13 @@ DISTI_UNUSED static int disti_finite_double(double x)
     uint64_t bits;
     memcpy(&bits, &x, sizeof bits);
     return (bits & 0x7ff0000000000000u) != 0x7ff0000000000000u;
+}
+
+/* *to += x; a sum beyond float's range is its largest number, and what is not finite adds nothing. */
+DISTI_UNUSED static void disti_add_gradient(float *to, double x)
+{
+    double sum = (double)*to + x, most = 3.4e38;
+    if (disti_finite_double(sum)) *to = (float)DISTI_MIN(DISTI_MAX(sum, -most), most);
 }
 
 /* *out = a * b or a + b; returns 0 and leaves SIZE_MAX if that does not fit. */
@@ -2746,8 +2761,8 @@ DIST_API dist_status dist_color_backward(dist_context *ctx, const dist_field *fi
     double *total = ctx->partial + (size_t)DISTI_SLOTS * size;
     memset(total, 0, size * sizeof(double));
     disti_color_backward_all(ctx, field, n, points, d_color, d_points, grads, total);
-    for (size_t j = 0; grads->code && j < code; j++) grads->code[j] += (float)total[j];
-    for (size_t j = code; grads->color_code && j < size; j++) grads->color_code[j - code] += (float)total[j];
+    for (size_t j = 0; grads->code && j < code; j++) disti_add_gradient(&grads->code[j], total[j]);
+    for (size_t j = code; grads->color_code && j < size; j++) disti_add_gradient(&grads->color_code[j - code], total[j]);
     return DIST_OK;
 }
 
@@ -2764,7 +2779,7 @@ static dist_status disti_code_begin(dist_context *ctx, const dist_field *field, 
 
 static void disti_code_end(const dist_field *field, const dist_gradients *grads, const double *d_code)
 {
-    for (size_t j = 0; d_code && j < (size_t)field->code_size; j++) grads->code[j] += (float)d_code[j];
+    for (size_t j = 0; d_code && j < (size_t)field->code_size; j++) disti_add_gradient(&grads->code[j], d_code[j]);
 }
 
 DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *field, size_t n, const float *points,
@@ -5312,6 +5327,37 @@ typedef struct disti_weights_job {
     int blocks;
 } disti_weights_job;
 
+/* Points whose numbers somewhere in the net are so large that their products overflow give no weight gradient, rather
+   than spoil that of all the others: their inputs and deltas in the store become 0. */
+static void disti_weights_drop(const dist_net *net, size_t columns, float *store)
+{
+    unsigned char bad[DISTI_BLOCK];
+    int any = 0;
+    memset(bad, 0, sizeof bad);
+    for (int pass = 0; pass < 1 + any; pass++) {
+        for (int l = 0; l < net->layers; l++) {
+            const disti_linear *layer = &net->layer[l];
+            size_t rows = l + 1 == net->layers ? 1 : (size_t)layer->out, wide = (size_t)(layer->prev + layer->point);
+            float *xt = store + disti_store_offset(net, l, DISTI_STORE_INPUT);
+            float *delta = store + disti_store_offset(net, l, DISTI_STORE_DELTA);
+            float *sums = store + disti_store_offset(net, l, DISTI_STORE_NORM);
+            for (size_t c = 0; c < columns; c++) {
+                float *x = xt + c * disti_store_stride(layer);
+                for (size_t k = 0; k < wide; k++)
+                    if (pass && bad[c]) x[k] = 0.0f;
+                    else bad[c] |= disti_is_huge(x[k]);
+            }
+            for (size_t o = 0; o < rows; o++)
+                for (size_t c = 0; c < columns; c++)
+                    if (pass && bad[c]) delta[o * DISTI_BLOCK + c] = 0.0f;
+                    else bad[c] |= disti_is_huge(delta[o * DISTI_BLOCK + c]);
+            for (size_t i = 0; i < 2 * disti_store_out(layer) && net->normed && l + 1 < net->layers; i++)
+                if (disti_is_huge(sums[i])) sums[i] = 0.0f;
+        }
+        for (size_t c = 0; c < columns; c++) any |= bad[c];
+    }
+}
+
 static void disti_weights_block(void *arg, int index, int worker)
 {
     const disti_weights_job *job = (const disti_weights_job *)arg;
@@ -5342,6 +5388,7 @@ static void disti_weights_block(void *arg, int index, int worker)
         disti_encode_backward(net, &b, g);
         pull = g;
     }
+    disti_weights_drop(net, job->directions ? DISTI_BLOCK : count, store);
     for (size_t i = 0; job->d_points && i < 3 * count; i++) job->d_points[3 * at + i] += pull[i];
     if (!job->d_code) return;
     memset(b.fold_sum, 0, (size_t)net->fold_count * (size_t)net->max_rows * sizeof(double));
@@ -7024,7 +7071,8 @@ static int disti_ray_bracketed(const disti_tracer *tracer, disti_ray *ray, float
     float flatter = DISTI_MIN(slope, other > 0.0f ? other : -other);
     if (slope > 1e-3f && magnitude <= tolerance * DISTI_MIN(0.5f * slope, flatter)) {
         ray->slope = -slope;
-        return disti_ray_end(ray, DIST_RAY_HIT, ray->q + f / slope, 0.0f, (magnitude + tracer->noise) / flatter);
+        float width = ray->b - ray->a, off = magnitude + tracer->noise;
+        return disti_ray_end(ray, DIST_RAY_HIT, ray->q + f / slope, 0.0f, off < width * flatter ? off / flatter : width);
     }
     if (inside) {
         ray->b = ray->q;
@@ -7109,7 +7157,7 @@ static int disti_ray_trusts(const disti_tracer *tracer, const disti_ray *ray, fl
 /* Feels ahead in the band 0 < f < epsilon, farther each time. */
 static int disti_ray_feel(const disti_tracer *tracer, disti_ray *ray, float epsilon)
 {
-    float reach = 2.0f * epsilon;
+    float reach = DISTI_MIN(2.0f * epsilon, 0.01f * tracer->field->radius);
     for (int i = 0; i < ray->side && reach < 0.01f * tracer->field->radius; i++) reach *= 1.5f;
     if (ray->slope < -1e-3f) reach = DISTI_MIN(1.2f * ray->f / -ray->slope, DISTI_MAX(reach, 64.0f * epsilon));
     float q = ray->s + DISTI_MAX(reach, 0.5f * epsilon);
@@ -7132,6 +7180,7 @@ static int disti_ray_band(const disti_tracer *tracer, disti_ray *ray, float f)
     if (f < ray->fb) {
         ray->b = ray->q;
         ray->fb = f;
+        if (f < 0.5f * ray->fa) ray->moved = 1; /* toward another surface than the one that it began at */
     }
     if (f >= 4.0f * epsilon || ray->q >= ray->leave) {
         if (ray->moved)
@@ -9084,12 +9133,12 @@ static void disti_render_seed(void *user, size_t first, size_t count, const floa
     for (size_t i = 0; i < count; i++) {
         disti_entry *entry = &tape->entry[first + i];
         const float *g = gradient + 3 * i, *v = entry->direction;
-        d_sdf[i] = entry->d_sdf;
-        entry->capped = 0;
-        entry->weight = 1.0f;
-        if (entry->d_distance == 0.0f) continue;
         float length = disti_length(g[0], g[1], g[2]);
-        if (!disti_finite(length) || !(length > 1e-30f)) {
+        entry->capped = !disti_finite(length); /* nothing comes of a point whose gradient overflows */
+        d_sdf[i] = entry->capped ? 0.0f : entry->d_sdf;
+        entry->weight = 1.0f;
+        if (entry->d_distance == 0.0f && !entry->capped) continue;
+        if (entry->capped || !(length > 1e-30f)) {
             entry->weight = 0.0f;
             continue;
         }
@@ -9101,6 +9150,9 @@ static void disti_render_seed(void *user, size_t first, size_t count, const floa
         float bounded = DISTI_MAX(magnitude, least);
         /* at along = 0 the sign is that of a ray that enters */
         d_sdf[i] += (along > 0.0f ? -1.0f : 1.0f) * entry->d_distance * entry->weight / (bounded * length);
+        if (disti_finite(d_sdf[i])) continue;
+        d_sdf[i] = entry->weight = 0.0f;
+        entry->capped = 1;
     }
 }
 
@@ -9160,7 +9212,8 @@ static void disti_backward_flush(disti_render_backward_job *job)
             p[k] = (double)tape->points[3 * i + k];
             y[k] = (double)tape->d_points[3 * i + k];
         }
-        disti_add_pull(job, p, y, (double)(entry->weight * entry->d_depth));
+        if (disti_finite_all(3, tape->d_points + 3 * i))
+            disti_add_pull(job, p, y, (double)(entry->weight * entry->d_depth));
     }
     job->points += job->count;
     job->count = 0;
@@ -9482,13 +9535,13 @@ DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *ta
     unsigned state = disti_float_state_enter(); /* also for what is not in disti_run */
     if (job.geometry || grads->color_code || grads->color_weights) disti_backward_pixels(&job);
     disti_float_state_leave(state);
-    for (size_t j = 0; grads->code && j < code; j++) grads->code[j] += (float)job.total[j];
-    for (size_t j = code; grads->color_code && j < size; j++) grads->color_code[j - code] += (float)job.total[j];
+    for (size_t j = 0; grads->code && j < code; j++) disti_add_gradient(&grads->code[j], job.total[j]);
+    for (size_t j = code; grads->color_code && j < size; j++) disti_add_gradient(&grads->color_code[j - code], job.total[j]);
     for (int i = 0; i < 3; i++) {
-        if (grads->rotation) grads->rotation[i] += (float)job.rotation[i];
-        if (grads->translation) grads->translation[i] += (float)job.translation[i];
-        if (grads->focal && i < 2) grads->focal[i] += (float)job.focal[i];
-        if (grads->principal && i < 2) grads->principal[i] += (float)job.principal[i];
+        if (grads->rotation) disti_add_gradient(&grads->rotation[i], job.rotation[i]);
+        if (grads->translation) disti_add_gradient(&grads->translation[i], job.translation[i]);
+        if (grads->focal && i < 2) disti_add_gradient(&grads->focal[i], job.focal[i]);
+        if (grads->principal && i < 2) disti_add_gradient(&grads->principal[i], job.principal[i]);
     }
     if (d_out->stats) {
         d_out->stats->capped += job.capped;

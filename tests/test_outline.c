@@ -278,6 +278,28 @@ TEST(a_sphere_is_found_by_its_color_alone)
     }
 }
 
+TEST(outline_gradient_has_the_same_bits_for_every_number_of_workers)
+{
+    static const int counts[3] = {1, 2, 7};
+    float code[4] = {0.1f, -0.05f, 0.05f, 0.6f};
+    result first, got;
+    for (int i = 0; i < 3; i++) {
+        test_scheduler scheduler;
+        dist_context_desc desc = test_context_desc();
+        memset(&scheduler, 0, sizeof scheduler);
+        scheduler.workers = desc.workers = counts[i];
+        desc.scheduler = test_scheduler_hook(&scheduler);
+        dist_context *ctx = dist_context_create(&desc);
+        dist_field field = flat_sphere(code);
+        dist_camera camera = camera_at(SIDE, 0.4);
+        dist_render_desc how = outline_how(3.0f * pixel_width(&camera));
+        dist_tape_destroy(outline_backward(ctx, &field, &camera, &how, &got));
+        if (i == 0) first = got;
+        CHECK_BYTES(offsetof(result, grads), &first, &got);
+        dist_context_destroy(ctx);
+    }
+}
+
 TEST(a_band_that_is_no_length_is_refused)
 {
     static const uint32_t wrong[3] = {0xbf800000u, 0x7fc00000u, 0x7f800000u}; /* -1, NaN, infinity */
@@ -304,6 +326,7 @@ int main(int argc, char **argv)
     RUN(outline_seeds_are_what_the_equation_says);
     RUN(outline_gradient_is_the_derivative_of_the_area_but_for_the_bands_width);
     RUN(a_sphere_is_found_by_its_color_alone);
+    RUN(outline_gradient_has_the_same_bits_for_every_number_of_workers);
     RUN(a_band_that_is_no_length_is_refused);
     return test_report();
 }

@@ -289,7 +289,8 @@ typedef struct dist_instance {
 /* Several instances as one field: f(p) = min over i of s_i f_i(R_i^T (p - t_i) / s_i). A point asks only the instances
    whose bounding spheres can hold the minimum, nearest first, and none of them outside its sphere: there f_i goes on as
    a lower bound of the distance, exact up to a fifth of the sphere's radius. Defaults that go by the bounding radius
-   (how.epsilon) go by the scene's. Belongs to the context that made it. */
+   (how.epsilon) go by the scene's. Every point is held against every sphere: fast up to some hundred instances; more are
+   better made scenes of scenes. Belongs to the context that made it. */
 typedef struct dist_scene dist_scene;
 /* NULL on failure. Instances may share fields; a scene's field may be an instance of another scene. */
 DIST_API dist_scene *dist_scene_create(dist_context *ctx, int count, const dist_instance *instances);

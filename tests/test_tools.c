@@ -182,7 +182,7 @@ TEST(closest_points_of_distances_are_exact)
             point_of(points + 3 * i, p);
             point_of(closest + 3 * i, q);
             f = shape_value(&shapes[k], p);
-            if (k == 3 && shape_length(p[0], p[1], p[2]) > 1) continue; /* no distance is asked: some rod that is near */
+            if (k == 3 && shape_length(p[0], p[1], p[2]) > 1) continue; /* asked elsewhere: some near rod */
             CHECK_EQUAL(DIST_RAY_HIT, status[i]);
             residual = fmax(residual, fabs(shape_value(&shapes[k], q)));
             worst = fmax(worst, fabs(fabs(f) - shape_length(p[0] - q[0], p[1] - q[1], p[2] - q[2])));

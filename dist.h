@@ -2408,6 +2408,8 @@ static dist_status disti_field_check(dist_context *ctx, const dist_field *field,
     return DIST_OK;
 }
 
+enum { DISTI_CHUNK = DISTI_SLOTS * 4 * DISTI_BLOCK }; /* points of a backward pass held at once */
+
 /* Work is cut into pieces of whole kernel blocks, at most 2^30 of them: the count follows from n alone. */
 typedef struct disti_pieces {
     size_t n, size;
@@ -2659,8 +2661,6 @@ static void disti_field_backward_all(dist_context *ctx, const dist_field *field,
     job.d_points = d_points;
     disti_backward_run(ctx, &job, n, d_code);
 }
-
-enum { DISTI_CHUNK = DISTI_SLOTS * 4 * DISTI_BLOCK }; /* points of a backward pass held at once */
 
 /* Between traces the tracer's part of the first worker's scratch is free: room for 21 floats a point of a chunk. */
 static float *disti_chunk_scratch(const dist_context *ctx)

@@ -3578,6 +3578,58 @@ DIST_API void dist_similarity_move(dist_similarity *placement, const float step[
 
 /*@ 05 net ---------------------------------------------------------------------------------------------------------- */
 
+static dist_status disti_capacity(dist_context *ctx, const char *function, size_t capacity, size_t need)
+{
+    return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: capacity is %d, must be at least %d", function, (double)capacity,
+                      (double)need);
+}
+
+typedef struct disti_writer {
+    unsigned char *out; /* NULL: only counted */
+    size_t size;        /* SIZE_MAX if it does not fit */
+} disti_writer;
+
+static void disti_put(disti_writer *w, const void *bytes, size_t size)
+{
+    if (w->out) memcpy(w->out + w->size, bytes, size);
+    disti_size_add(w->size, size, &w->size);
+}
+
+/* Little-endian on every machine. */
+static void disti_put_word(disti_writer *w, uint32_t x)
+{
+    unsigned char bytes[4];
+    for (int i = 0; i < 4; i++) bytes[i] = (unsigned char)(x >> 8 * i & 255u);
+    disti_put(w, bytes, sizeof bytes);
+}
+
+static void disti_put_float(disti_writer *w, float x)
+{
+    uint32_t bits;
+    memcpy(&bits, &x, sizeof bits);
+    disti_put_word(w, bits);
+}
+
+static void disti_put_text(disti_writer *w, const char *text)
+{
+    disti_put(w, text, strlen(text));
+}
+
+static void disti_put_size(disti_writer *w, size_t value)
+{
+    char digits[24];
+    size_t n = sizeof digits;
+    do digits[--n] = (char)('0' + value % 10);
+    while (value /= 10);
+    disti_put(w, digits + n, sizeof digits - n);
+}
+
+static void disti_put_number(disti_writer *w, double x, int digits)
+{
+    char text[32];
+    disti_put(w, text, disti_format_number(text, x, digits));
+}
+
 /* The container of a model: safetensors. Eight bytes give the header's length (little-endian), the header is a JSON
    object name -> {dtype, shape, data_offsets}, and the tensors' bytes follow without overlap or hole, in any alignment.
    The file is hostile: the header is read twice, first counted and then kept, so that one block of the exact size holds
@@ -3624,24 +3676,18 @@ typedef struct disti_reader {
    Always 0. */
 static int disti_bad(const disti_reader *r, const char *what, const char *text, double a, double b)
 {
-    char format[320];
-    size_t n = 0;
-    for (const char *c = r->function; *c && n < 40; c++) format[n++] = *c;
-    format[n++] = ':';
-    format[n++] = ' ';
-    for (const char *c = r->kind; *c; c++) format[n++] = *c;
-    format[n++] = ' ';
-    if (r->name) {
-        format[n++] = '"';
-        for (size_t i = 0; i < r->name_size && i < 80; i++) {
-            unsigned char c = r->name[i];
-            format[n++] = c >= ' ' && c <= '~' && c != '%' ? (char)c : '?';
-        }
-        format[n++] = '"';
-        format[n++] = ' ';
+    char format[400];
+    disti_writer w = {(unsigned char *)format, 0};
+    disti_put_text(&w, r->function);
+    disti_put_text(&w, ": ");
+    disti_put_text(&w, r->kind);
+    disti_put_text(&w, r->name ? " \"" : " ");
+    for (size_t i = 0; r->name && i < r->name_size && i < 80; i++) {
+        unsigned char c = r->name[i];
+        disti_put(&w, c >= ' ' && c <= '~' && c != '%' ? &c : (const unsigned char *)"?", 1);
     }
-    for (const char *c = what; *c && n + 1 < sizeof format; c++) format[n++] = *c;
-    format[n] = 0;
+    if (r->name) disti_put_text(&w, "\" ");
+    disti_put(&w, what, strlen(what) + 1);
     disti_fail(r->ctx, DIST_BAD_FILE, format, text, a, b);
     return 0;
 }
@@ -3965,14 +4011,10 @@ static void disti_sort(size_t n, const void **items, int (*compare_fn)(const voi
     }
 }
 
-static int disti_compare_text(const void *a, const void *b)
-{
-    return strcmp((const char *)a, (const char *)b);
-}
-
+/* Of two places where a name is pointed to: keys, or tensors, which begin with theirs. */
 static int disti_compare_name(const void *a, const void *b)
 {
-    return strcmp(((const disti_tensor *)a)->name, ((const disti_tensor *)b)->name);
+    return strcmp(*(const char *const *)a, *(const char *const *)b);
 }
 
 static int disti_compare_data(const void *a, const void *b)
@@ -3982,18 +4024,26 @@ static int disti_compare_data(const void *a, const void *b)
     return x->bytes < y->bytes ? -1 : x->bytes > y->bytes;
 }
 
+/* Sorts by name; 0 if one stands twice. */
+static int disti_archive_unique(disti_reader *r, const char *kind, size_t n, const void **order)
+{
+    disti_sort(n, order, disti_compare_name);
+    for (size_t i = 1; i < n; i++) {
+        if (disti_compare_name(order[i - 1], order[i]) != 0) continue;
+        const char *name = *(const char *const *)order[i];
+        disti_archive_about(r, kind, name, strlen(name));
+        return disti_bad(r, "stands in the header twice", NULL, 0, 0);
+    }
+    return 1;
+}
+
 /* What no single entry shows: names that stand twice, overlaps, holes. Leaves the order by name. */
 static int disti_archive_check(disti_reader *r)
 {
     disti_archive *archive = r->archive;
     const void **order = archive->order;
-    for (size_t i = 0; i < archive->meta_count; i++) order[i] = archive->keys[i];
-    disti_sort(archive->meta_count, order, disti_compare_text);
-    for (size_t i = 1; i < archive->meta_count; i++) {
-        if (disti_compare_text(order[i - 1], order[i]) != 0) continue;
-        disti_archive_about(r, "metadata key", order[i], strlen((const char *)order[i]));
-        return disti_bad(r, "stands in the header twice", NULL, 0, 0);
-    }
+    for (size_t i = 0; i < archive->meta_count; i++) order[i] = &archive->keys[i];
+    if (!disti_archive_unique(r, "metadata key", archive->meta_count, order)) return 0;
     for (size_t i = 0; i < archive->tensor_count; i++) order[i] = &archive->tensors[i];
     disti_sort(archive->tensor_count, order, disti_compare_data);
     const unsigned char *next = r->end;
@@ -4010,14 +4060,7 @@ static int disti_archive_check(disti_reader *r)
     if (next != r->end + r->data_size)
         return disti_bad(r, "has %d bytes of data, must have %d for its tensors", NULL, (double)r->data_size,
                          (double)(next - r->end));
-    disti_sort(archive->tensor_count, order, disti_compare_name);
-    for (size_t i = 1; i < archive->tensor_count; i++) {
-        if (disti_compare_name(order[i - 1], order[i]) != 0) continue;
-        const char *name = ((const disti_tensor *)order[i])->name;
-        disti_archive_about(r, "tensor", name, strlen(name));
-        return disti_bad(r, "stands in the header twice", NULL, 0, 0);
-    }
-    return 1;
+    return disti_archive_unique(r, "tensor", archive->tensor_count, order);
 }
 
 /* The first byte that is not UTF-8 (nor is a code too long, above 10ffff or half a surrogate pair), or the end. */
@@ -4249,52 +4292,6 @@ typedef struct disti_tensor_out {
     size_t shape[4];
     const float *data;
 } disti_tensor_out;
-
-static dist_status disti_capacity(dist_context *ctx, const char *function, size_t capacity, size_t need)
-{
-    return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: capacity is %d, must be at least %d", function, (double)capacity,
-                      (double)need);
-}
-
-typedef struct disti_writer {
-    unsigned char *out; /* NULL: only counted */
-    size_t size;        /* SIZE_MAX if it does not fit */
-} disti_writer;
-
-static void disti_put(disti_writer *w, const void *bytes, size_t size)
-{
-    if (w->out) memcpy(w->out + w->size, bytes, size);
-    disti_size_add(w->size, size, &w->size);
-}
-
-/* Little-endian on every machine. */
-static void disti_put_word(disti_writer *w, uint32_t x)
-{
-    unsigned char bytes[4];
-    for (int i = 0; i < 4; i++) bytes[i] = (unsigned char)(x >> 8 * i & 255u);
-    disti_put(w, bytes, sizeof bytes);
-}
-
-static void disti_put_float(disti_writer *w, float x)
-{
-    uint32_t bits;
-    memcpy(&bits, &x, sizeof bits);
-    disti_put_word(w, bits);
-}
-
-static void disti_put_text(disti_writer *w, const char *text)
-{
-    disti_put(w, text, strlen(text));
-}
-
-static void disti_put_size(disti_writer *w, size_t value)
-{
-    char digits[24];
-    size_t n = sizeof digits;
-    do digits[--n] = (char)('0' + value % 10);
-    while (value /= 10);
-    disti_put(w, digits + n, sizeof digits - n);
-}
 
 /* In quotes, escaped. */
 static void disti_put_string(disti_writer *w, const char *text)
@@ -5937,41 +5934,48 @@ typedef struct disti_loader {
     const char *function;
     const char *prefix;
     dist_net *net;
+    dist_status status; /* of the first failure: after it nothing more is read */
     int skip[DISTI_MAX_LAYERS];
     float skip_scale;
 } disti_loader;
 
-/* "prefix" "stem" K "ending", K below 100 */
+/* "prefix" "stem" K "ending" into name */
+static void disti_tensor_name(unsigned char *name, const char *prefix, const char *stem, int k, const char *ending)
+{
+    disti_writer w = {name, 0};
+    disti_put_text(&w, prefix);
+    disti_put_text(&w, stem);
+    disti_put_size(&w, (size_t)k);
+    disti_put(&w, ending, strlen(ending) + 1);
+}
+
 static const disti_tensor *disti_loader_find(const disti_loader *loader, const char *stem, int k, const char *ending)
 {
     char name[96];
-    size_t n = 0;
-    const char *parts[3];
-    parts[0] = loader->prefix;
-    parts[1] = stem;
-    parts[2] = ending;
-    for (int i = 0; i < 3; i++) {
-        if (i == 2 && k >= 10) name[n++] = (char)('0' + k / 10);
-        if (i == 2) name[n++] = (char)('0' + k % 10);
-        for (const char *c = parts[i]; *c; c++) name[n++] = *c;
-    }
-    name[n] = 0;
+    disti_tensor_name((unsigned char *)name, loader->prefix, stem, k, ending);
     return disti_archive_find(&loader->archive, name);
 }
 
-static dist_status disti_loader_bad(const disti_loader *loader, const char *key)
+/* Keeps the first failure. Returns it. */
+static dist_status disti_loader_fail(disti_loader *loader, dist_status status, const char *format, const char *text,
+                                     double a, double b)
+{
+    if (loader->status == DIST_OK) loader->status = disti_fail(loader->ctx, status, format, text, a, b);
+    return loader->status;
+}
+
+static dist_status disti_loader_bad(disti_loader *loader, const char *key)
 {
     const char *value = disti_archive_meta(&loader->archive, key);
-    char text[160];
-    size_t n = 0;
-    for (const char *c = key; *c && n < 60; c++) text[n++] = *c;
-    memcpy(text + n, " is \"", 5);
-    n += 5;
-    for (const char *c = value ? value : ""; *c && n < 140; c++) text[n++] = *c;
-    text[n++] = '"';
-    text[n] = 0;
-    return disti_fail(loader->ctx, DIST_BAD_FILE,
-                      "dist_net_load: metadata %s, which is not one of the values it can have", text, 0, 0);
+    unsigned char text[160];
+    disti_writer w = {text, 0};
+    disti_put_text(&w, key);
+    disti_put_text(&w, " is \"");
+    disti_put(&w, value ? value : "", value ? DISTI_MIN(strlen(value), (size_t)80) : 0);
+    disti_put(&w, "\"", 2);
+    return disti_loader_fail(loader, DIST_BAD_FILE,
+                             "dist_net_load: metadata %s, which is not one of the values it can have",
+                             (const char *)text, 0, 0);
 }
 
 /* A number at **s, or failure; advances. */
@@ -5980,31 +5984,33 @@ static int disti_scan_number(const char **s, double *out)
     return disti_parse_double(s, *s + strlen(*s), out) && disti_finite_double(*out);
 }
 
-/* A metadata number within [low, high]; absent: *out keeps its default. */
-static dist_status disti_loader_number(const disti_loader *loader, const char *key, double low, double high,
-                                       double *out)
+/* A metadata number within [low, high]; absent: value. */
+static double disti_loader_number(disti_loader *loader, const char *key, double low, double high, double value)
 {
     const char *s = disti_archive_meta(&loader->archive, key);
-    double value;
-    if (!s) return DIST_OK;
-    if (!disti_scan_number(&s, &value) || *s || value < low || value > high) return disti_loader_bad(loader, key);
-    *out = value;
-    return DIST_OK;
+    if (s && (!disti_scan_number(&s, &value) || *s || value < low || value > high)) disti_loader_bad(loader, key);
+    return loader->status == DIST_OK ? value : low;
 }
 
-/* Index of a metadata value in a |-separated list; absent: 0; none of them: -1. */
-static int disti_loader_choice(const disti_loader *loader, const char *key, const char *choices)
+/* A whole one. */
+static int disti_loader_whole(disti_loader *loader, const char *key, double low, double high, double value)
 {
-    const char *value = disti_archive_meta(&loader->archive, key);
-    if (!value) return 0;
-    size_t n = strlen(value);
-    for (int index = 0;; index++) {
-        const char *end = strchr(choices, '|');
+    value = disti_loader_number(loader, key, low, high, value);
+    if (value != (int)value) disti_loader_bad(loader, key);
+    return (int)value;
+}
+
+/* Index of a metadata value in a |-separated list; absent or none of them: 0. */
+static int disti_loader_choice(disti_loader *loader, const char *key, const char *choices)
+{
+    const char *value = disti_archive_meta(&loader->archive, key), *end = choices;
+    for (int index = 0; value && end; index++, choices = end + 1) {
+        end = strchr(choices, '|');
         size_t length = end ? (size_t)(end - choices) : strlen(choices);
-        if (length == n && memcmp(choices, value, n) == 0) return index;
-        if (!end) return -1;
-        choices = end + 1;
+        if (length == strlen(value) && memcmp(choices, value, length) == 0) return index;
     }
+    if (value) disti_loader_bad(loader, key);
+    return 0;
 }
 
 static dist_status disti_loader_activation(disti_loader *loader)
@@ -6012,22 +6018,18 @@ static dist_status disti_loader_activation(disti_loader *loader)
     static const char names[6][12] = {"relu", "elu", "softplus", "sine", "tanh", "none"};
     dist_net *net = loader->net;
     const char *s = disti_archive_meta(&loader->archive, "dist.activation");
-    double first = 1.0, other;
     int index = 0;
     if (!s) return DIST_OK;
     size_t n = strcspn(s, ":");
     while (index < 6 && !(strlen(names[index]) == n && memcmp(names[index], s, n) == 0)) index++;
-    if (index == 6) return disti_loader_bad(loader, "dist.activation");
-    net->activation = index;
-    int scaled = index == DIST_ACTIVATION_SOFTPLUS || index == DIST_ACTIVATION_SINE;
     s += n;
-    if (!scaled) return *s ? disti_loader_bad(loader, "dist.activation") : DIST_OK;
-    first = index == DIST_ACTIVATION_SINE ? 30.0 : 1.0; /* SIREN's omega, PyTorch's beta */
-    if (*s == ':' && (s++, !disti_scan_number(&s, &first))) return disti_loader_bad(loader, "dist.activation");
-    other = first;
-    if (index == DIST_ACTIVATION_SINE && *s == ',' && (s++, !disti_scan_number(&s, &other)))
-        return disti_loader_bad(loader, "dist.activation");
-    if (*s || !(first >= 1e-6 && first <= 1e6 && other >= 1e-6 && other <= 1e6))
+    net->activation = index;
+    int sine = index == DIST_ACTIVATION_SINE, scaled = sine || index == DIST_ACTIVATION_SOFTPLUS;
+    double first = sine ? 30.0 : 1.0; /* SIREN's omega, PyTorch's beta */
+    int good = index < 6 && (!scaled || *s != ':' || (s++, disti_scan_number(&s, &first)));
+    double other = first;
+    good = good && (!sine || *s != ',' || (s++, disti_scan_number(&s, &other)));
+    if (!good || *s || !(first >= 1e-6 && first <= 1e6 && other >= 1e-6 && other <= 1e6))
         return disti_loader_bad(loader, "dist.activation");
     net->first_scale = (float)first;
     net->scale = (float)other;
@@ -6058,47 +6060,26 @@ static dist_status disti_loader_channels(disti_loader *loader)
 static dist_status disti_loader_meta(disti_loader *loader)
 {
     dist_net *net = loader->net;
-    double levels = 0, base = 3.14159265358979323846, epsilon = 1e-5, level = 0, bound = 1, raw = 1, scale = 1;
-    dist_status status = disti_loader_activation(loader);
-    if (status == DIST_OK) status = disti_loader_channels(loader);
-    if (status != DIST_OK) return status;
     static const int outputs[4] = {DISTI_OUTPUT_TANH, DISTI_OUTPUT_NONE, DISTI_OUTPUT_SIGMOID, DISTI_OUTPUT_TANH_TWICE};
-    int output = disti_loader_choice(loader, "dist.output", "tanh|none|sigmoid|tanh:2");
-    int input = disti_loader_choice(loader, "dist.input", "code,xyz|xyz,code");
-    int order = disti_loader_choice(loader, "dist.skip_order", "x,input|input,x");
+    if (disti_loader_activation(loader) != DIST_OK || disti_loader_channels(loader) != DIST_OK) return loader->status;
     int encoding = disti_loader_choice(loader, "dist.encoding", "none|fourier");
-    int sines = disti_loader_choice(loader, "dist.encoding.order", "sin,cos|cos_all,sin_all|sin_all,cos_all");
-    int norm = disti_loader_choice(loader, "dist.norm", "none|layer");
-    if (output < 0) return disti_loader_bad(loader, "dist.output");
-    if (input < 0) return disti_loader_bad(loader, "dist.input");
-    if (order < 0) return disti_loader_bad(loader, "dist.skip_order");
-    if (encoding < 0) return disti_loader_bad(loader, "dist.encoding");
-    if (sines < 0) return disti_loader_bad(loader, "dist.encoding.order");
-    if (norm < 0) return disti_loader_bad(loader, "dist.norm");
-    if ((status = disti_loader_number(loader, "dist.encoding.levels", 0, DISTI_MAX_LEVELS, &levels)) != DIST_OK)
-        return status;
-    if ((status = disti_loader_number(loader, "dist.encoding.base", 1e-6, 1e6, &base)) != DIST_OK) return status;
-    if ((status = disti_loader_number(loader, "dist.encoding.raw", 0, 1, &raw)) != DIST_OK) return status;
-    if ((status = disti_loader_number(loader, "dist.skip_scale", 1e-6, 1e6, &scale)) != DIST_OK) return status;
-    if ((status = disti_loader_number(loader, "dist.norm.epsilon", 0, 1, &epsilon)) != DIST_OK) return status;
-    if ((status = disti_loader_number(loader, "dist.level", -1e6, 1e6, &level)) != DIST_OK) return status;
-    if ((status = disti_loader_number(loader, "dist.bound", 1e-6, 1e6, &bound)) != DIST_OK) return status;
-    if (levels != (int)levels) return disti_loader_bad(loader, "dist.encoding.levels");
-    if (raw != (int)raw) return disti_loader_bad(loader, "dist.encoding.raw");
-    net->output = outputs[output];
-    net->point_first = input;
-    net->skip_input_first = order;
-    net->levels = encoding ? (int)levels : 0;
-    net->raw = encoding ? (int)raw : 1;
-    net->order = sines;
-    net->base = base;
-    net->normed = norm;
-    net->norm_epsilon = (float)epsilon;
-    net->level = (float)level;
-    net->bound = (float)bound;
+    int levels = disti_loader_whole(loader, "dist.encoding.levels", 0, DISTI_MAX_LEVELS, 0);
+    int raw = disti_loader_whole(loader, "dist.encoding.raw", 0, 1, 1);
+    net->output = outputs[disti_loader_choice(loader, "dist.output", "tanh|none|sigmoid|tanh:2")];
+    net->point_first = disti_loader_choice(loader, "dist.input", "code,xyz|xyz,code");
+    net->skip_input_first = disti_loader_choice(loader, "dist.skip_order", "x,input|input,x");
+    net->levels = encoding ? levels : 0;
+    net->raw = encoding ? raw : 1;
+    net->order = disti_loader_choice(loader, "dist.encoding.order", "sin,cos|cos_all,sin_all|sin_all,cos_all");
+    net->base = disti_loader_number(loader, "dist.encoding.base", 1e-6, 1e6, 3.14159265358979323846);
+    net->normed = disti_loader_choice(loader, "dist.norm", "none|layer");
+    net->norm_epsilon = (float)disti_loader_number(loader, "dist.norm.epsilon", 0, 1, 1e-5);
+    net->level = (float)disti_loader_number(loader, "dist.level", -1e6, 1e6, 0);
+    net->bound = (float)disti_loader_number(loader, "dist.bound", 1e-6, 1e6, 1);
     net->point_size = (net->raw ? 3 : 0) + 6 * net->levels;
-    loader->skip_scale = (float)scale;
-    return net->point_size > 0 ? DIST_OK : disti_loader_bad(loader, "dist.encoding.levels");
+    loader->skip_scale = (float)disti_loader_number(loader, "dist.skip_scale", 1e-6, 1e6, 1);
+    if (loader->status == DIST_OK && net->point_size == 0) disti_loader_bad(loader, "dist.encoding.levels");
+    return loader->status;
 }
 
 /* The weight tensor of layer k: plain, or v of a weight-norm pair in either spelling with *gain its g. */
@@ -6119,7 +6100,7 @@ static dist_status disti_loader_shapes(disti_loader *loader)
     dist_net *net = loader->net;
     const char *list = disti_archive_meta(&loader->archive, "dist.skip");
     const disti_tensor *gain;
-    double size, clamp, at;
+    double at;
     loader->prefix = "";
     if (!disti_loader_weight(loader, 0, &gain)) loader->prefix = "module.";
     for (int k = 0; k < DISTI_MAX_LAYERS; k++) {
@@ -6127,7 +6108,7 @@ static dist_status disti_loader_shapes(disti_loader *loader)
         if (!w) break;
         if (w->rank != 2 || w->shape[0] < 1 || w->shape[1] < 1 || w->shape[0] > DISTI_MAX_WIDTH ||
             w->shape[1] > 2 * DISTI_MAX_WIDTH)
-            return disti_fail(loader->ctx, DIST_BAD_FILE,
+            return disti_loader_fail(loader, DIST_BAD_FILE,
                               "dist_net_load: tensor %s must be (out, in) of at most %d by %d", w->name,
                               DISTI_MAX_WIDTH, 2 * DISTI_MAX_WIDTH);
         net->layer[k].out = (int)w->shape[0];
@@ -6135,26 +6116,27 @@ static dist_status disti_loader_shapes(disti_loader *loader)
         net->layers++;
     }
     if (net->layers == 0)
-        return disti_fail(
-            loader->ctx, DIST_BAD_FILE,
+        return disti_loader_fail(loader, DIST_BAD_FILE,
             "dist_net_load: no tensor is called lin0.weight, lin0.weight_v or the like (also with module. before it)",
             NULL, 0, 0);
     for (int k = net->layers + 1; k <= DISTI_MAX_LAYERS; k++)
         if (disti_loader_weight(loader, k, &gain))
-            return disti_fail(loader->ctx, DIST_BAD_FILE, "dist_net_load: layer %d is there, but layer %d is missing",
+            return disti_loader_fail(loader, DIST_BAD_FILE, "dist_net_load: layer %d is there, but layer %d is missing",
                               NULL, k, net->layers);
     if (net->layers == DISTI_MAX_LAYERS && disti_loader_weight(loader, DISTI_MAX_LAYERS, &gain))
-        return disti_fail(loader->ctx, DIST_UNSUPPORTED, "dist_net_load: more than %d layers", NULL, DISTI_MAX_LAYERS,
+        return disti_loader_fail(loader, DIST_UNSUPPORTED, "dist_net_load: more than %d layers", NULL, DISTI_MAX_LAYERS,
                           0);
-    size = net->layer[0].in - net->point_size;
-    if (disti_loader_number(loader, "dist.code_size", 0, DISTI_MAX_WIDTH, &size) != DIST_OK) return DIST_BAD_FILE;
+    double size = disti_loader_number(loader, "dist.code_size", 0, DISTI_MAX_WIDTH,
+                                      net->layer[0].in - net->point_size);
+    if (loader->status != DIST_OK) return loader->status;
     if (size < 0)
-        return disti_fail(loader->ctx, DIST_BAD_FILE, "dist_net_load: lin0 takes %d numbers, fewer than the point's %d",
-                          NULL, net->layer[0].in, net->point_size);
+        return disti_loader_fail(loader, DIST_BAD_FILE,
+                                 "dist_net_load: lin0 takes %d numbers, fewer than the point's %d", NULL,
+                                 net->layer[0].in, net->point_size);
     if (size != (int)size || size + net->point_size != net->layer[0].in)
-        return disti_fail(loader->ctx, DIST_BAD_FILE,
-                          "dist_net_load: layer 0 takes %d numbers, but code and point have %d", NULL, net->layer[0].in,
-                          size + net->point_size);
+        return disti_loader_fail(loader, DIST_BAD_FILE,
+                                 "dist_net_load: layer 0 takes %d numbers, but code and point have %d", NULL,
+                                 net->layer[0].in, size + net->point_size);
     net->code_size = (int)size;
     for (int l = 1; l < net->layers && !list; l++)
         loader->skip[l] = net->layer[l].in == net->layer[l - 1].out + net->layer[0].in;
@@ -6165,31 +6147,30 @@ static dist_status disti_loader_shapes(disti_loader *loader)
         if (*list == ',') list++;
     }
     if (net->layer[net->layers - 1].out != net->channels)
-        return disti_fail(loader->ctx, DIST_BAD_FILE,
+        return disti_loader_fail(loader, DIST_BAD_FILE,
                           "dist_net_load: the last layer gives %d numbers, but dist.channels names %d", NULL,
                           net->layer[net->layers - 1].out, net->channels);
-    clamp = net->code_size > 0 ? (double)0.1f : 0.0;
-    if (disti_loader_number(loader, "dist.clamp", 0, 1e6, &clamp) != DIST_OK) return DIST_BAD_FILE;
-    net->clamp = (float)clamp;
-    return DIST_OK;
+    net->clamp = (float)disti_loader_number(loader, "dist.clamp", 0, 1e6, net->code_size > 0 ? (double)0.1f : 0.0);
+    return loader->status;
 }
 
 /* Tensor -> count floats, all finite. */
-static dist_status disti_loader_read(const disti_loader *loader, const disti_tensor *tensor, const char *what, int k,
+static dist_status disti_loader_read(disti_loader *loader, const disti_tensor *tensor, const char *what, int k,
                                      size_t count, float *out)
 {
+    if (loader->status != DIST_OK) return loader->status;
     if (!tensor)
-        return disti_fail(loader->ctx, DIST_BAD_FILE, "dist_net_load: tensor %s of layer %d is missing", what, k, 0);
+        return disti_loader_fail(loader, DIST_BAD_FILE, "dist_net_load: tensor %s of layer %d is missing", what, k, 0);
     if (tensor->dtype == DISTI_DTYPE_OTHER)
-        return disti_fail(loader->ctx, DIST_UNSUPPORTED, "dist_net_load: tensor %s must be F32, F16 or BF16",
+        return disti_loader_fail(loader, DIST_UNSUPPORTED, "dist_net_load: tensor %s must be F32, F16 or BF16",
                           tensor->name, 0, 0);
     if (tensor->count != count)
-        return disti_fail(loader->ctx, DIST_BAD_FILE, "dist_net_load: tensor %s has %d numbers, must have %d",
+        return disti_loader_fail(loader, DIST_BAD_FILE, "dist_net_load: tensor %s has %d numbers, must have %d",
                           tensor->name, (double)tensor->count, (double)count);
     disti_tensor_read(tensor, out);
     for (size_t i = 0; i < count; i++)
         if (!disti_finite(out[i]))
-            return disti_fail(loader->ctx, DIST_NOT_FINITE,
+            return disti_loader_fail(loader, DIST_NOT_FINITE,
                               "dist_net_load: tensor %s holds %d at place %d, must be finite", tensor->name,
                               (double)out[i], (double)i);
     return DIST_OK;
@@ -6210,27 +6191,22 @@ static void disti_weight_norm(size_t out, size_t in, const float *gain, float *v
 static dist_status disti_loader_values(disti_loader *loader)
 {
     dist_net *net = loader->net;
-    dist_status status;
     for (int l = 0; l < net->layers; l++) {
         const disti_linear *layer = &net->layer[l];
         const disti_tensor *gain, *weight = disti_loader_weight(loader, l, &gain);
         size_t out = (size_t)layer->out, in = (size_t)layer->in;
         float *w = net->params + layer->weight, *bias = net->params + layer->bias;
-        if ((status = disti_loader_read(loader, weight, "weight", l, out * in, w)) != DIST_OK) return status;
-        if (gain) {
-            if ((status = disti_loader_read(loader, gain, "weight_g", l, out, bias)) != DIST_OK) return status;
+        disti_loader_read(loader, weight, "weight", l, out * in, w);
+        if (gain && disti_loader_read(loader, gain, "weight_g", l, out, bias) == DIST_OK)
             disti_weight_norm(out, in, bias, w);
-        }
-        if ((status = disti_loader_read(loader, disti_loader_find(loader, "lin", l, ".bias"), "bias", l, out, bias)) !=
-            DIST_OK)
-            return status;
+        disti_loader_read(loader, disti_loader_find(loader, "lin", l, ".bias"), "bias", l, out, bias);
         if (!net->normed || l + 1 == net->layers) continue;
-        if ((status = disti_loader_read(loader, disti_loader_find(loader, "norm", l, ".weight"), "norm weight", l, out,
-                                        net->params + layer->norm_weight)) != DIST_OK) return status;
-        if ((status = disti_loader_read(loader, disti_loader_find(loader, "norm", l, ".bias"), "norm bias", l, out,
-                                        net->params + layer->norm_bias)) != DIST_OK) return status;
+        disti_loader_read(loader, disti_loader_find(loader, "norm", l, ".weight"), "norm weight", l, out,
+                          net->params + layer->norm_weight);
+        disti_loader_read(loader, disti_loader_find(loader, "norm", l, ".bias"), "norm bias", l, out,
+                          net->params + layer->norm_bias);
     }
-    if (net->code_count == 0) return DIST_OK;
+    if (net->code_count == 0) return loader->status;
     return disti_loader_read(loader, disti_archive_find(&loader->archive, "codes"), "codes", 0,
                              (size_t)net->code_count * (size_t)net->code_size, net->codes);
 }
@@ -6240,8 +6216,8 @@ static dist_status disti_loader_codes(disti_loader *loader)
     const disti_tensor *codes = disti_archive_find(&loader->archive, "codes");
     if (!codes || loader->net->code_size == 0) return DIST_OK;
     if (codes->rank != 2 || codes->shape[1] != (size_t)loader->net->code_size || codes->shape[0] > 0x7fffffffu)
-        return disti_fail(loader->ctx, DIST_BAD_FILE, "dist_net_load: tensor codes must be (n, %d)", NULL,
-                          loader->net->code_size, 0);
+        return disti_loader_fail(loader, DIST_BAD_FILE, "dist_net_load: tensor codes must be (n, %d)", NULL,
+                                 loader->net->code_size, 0);
     loader->net->code_count = (int)codes->shape[0];
     return DIST_OK;
 }
@@ -6257,19 +6233,15 @@ DIST_API dist_net *dist_net_load(dist_context *ctx, const void *bytes, size_t si
     memset(&loader, 0, sizeof loader);
     loader.ctx = ctx;
     loader.function = "dist_net_load";
-    dist_status status = disti_archive_open(ctx, loader.function, bytes, size, &loader.archive);
-    if (status == DIST_OK) {
-        loader.net = disti_net_new(ctx);
-        status = loader.net ? DIST_OK : DIST_OUT_OF_MEMORY;
-    }
-    if (status == DIST_OK) status = disti_loader_meta(&loader);
-    if (status == DIST_OK) status = disti_loader_shapes(&loader);
-    if (status == DIST_OK) status = disti_loader_codes(&loader);
-    if (status == DIST_OK) status = disti_net_arrange(ctx, loader.net, loader.function, loader.skip, loader.skip_scale);
-    if (status == DIST_OK) status = disti_loader_values(&loader);
-    if (status == DIST_OK) disti_net_pack(loader.net);
+    int good = disti_archive_open(ctx, loader.function, bytes, size, &loader.archive) == DIST_OK;
+    if (good) loader.net = disti_net_new(ctx);
+    good = loader.net && disti_loader_meta(&loader) == DIST_OK && disti_loader_shapes(&loader) == DIST_OK &&
+           disti_loader_codes(&loader) == DIST_OK &&
+           disti_net_arrange(ctx, loader.net, loader.function, loader.skip, loader.skip_scale) == DIST_OK &&
+           disti_loader_values(&loader) == DIST_OK;
+    if (good) disti_net_pack(loader.net);
     disti_archive_close(ctx, &loader.archive);
-    if (status == DIST_OK) return loader.net;
+    if (good) return loader.net;
     dist_net_destroy(loader.net);
     return NULL;
 }
@@ -6277,8 +6249,9 @@ DIST_API dist_net *dist_net_load(dist_context *ctx, const void *bytes, size_t si
 /* Text of the metadata being written, one value after another. */
 typedef struct disti_saver {
     const char *keys[24], *values[24];
-    size_t count, at;
-    char text[1024];
+    size_t count;
+    disti_writer w;
+    unsigned char text[1024];
 } disti_saver;
 
 static void disti_saver_text(disti_saver *s, const char *key, const char *value)
@@ -6287,20 +6260,22 @@ static void disti_saver_text(disti_saver *s, const char *key, const char *value)
     s->values[s->count++] = value;
 }
 
+/* The text since `at`, ended. */
+static const char *disti_saver_end(disti_saver *s, size_t at)
+{
+    disti_put(&s->w, "", 1);
+    return (const char *)s->text + at;
+}
+
 /* key: before a, and b with a comma unless it is the same number */
 static void disti_saver_number(disti_saver *s, const char *key, const char *before, double a, double b, int digits)
 {
-    size_t n = strlen(before);
-    char *to = s->text + s->at;
-    memcpy(to, before, n);
-    n += disti_format_number(to + n, a, digits);
-    if (a != b) {
-        to[n++] = ',';
-        n += disti_format_number(to + n, b, digits);
-    }
-    to[n++] = 0;
-    s->at += n;
-    disti_saver_text(s, key, to);
+    size_t at = s->w.size;
+    disti_put_text(&s->w, before);
+    disti_put_number(&s->w, a, digits);
+    if (a != b) disti_put_text(&s->w, ",");
+    if (a != b) disti_put_number(&s->w, b, digits);
+    disti_saver_text(s, key, disti_saver_end(s, at));
 }
 
 static void disti_saver_meta(disti_saver *s, const dist_net *net)
@@ -6309,22 +6284,21 @@ static void disti_saver_meta(disti_saver *s, const dist_net *net)
     static const char outputs[4][8] = {"none", "tanh", "sigmoid", "tanh:2"};
     static const char orders[3][16] = {"sin,cos", "cos_all,sin_all", "sin_all,cos_all"};
     float skip_scale = 1.0f;
-    char *skip = s->text, *channels;
     memset(s, 0, sizeof *s);
+    s->w.out = s->text;
     for (int l = 1; l < net->layers; l++) {
         if (!net->layer[l].point) continue;
-        if (s->at) skip[s->at++] = ',';
-        s->at += disti_format_number(skip + s->at, l, 6);
+        if (s->w.size) disti_put_text(&s->w, ",");
+        disti_put_size(&s->w, (size_t)l);
         skip_scale = net->layer[l].scale;
     }
-    channels = s->text + ++s->at;
+    const char *skip = disti_saver_end(s, 0);
+    size_t at = s->w.size;
     for (int c = 0; c < net->channels; c++) {
-        size_t n = strlen(net->channel_names[c]);
-        if (c) s->text[s->at++] = ',';
-        memcpy(s->text + s->at, net->channel_names[c], n);
-        s->at += n;
+        if (c) disti_put_text(&s->w, ",");
+        disti_put_text(&s->w, net->channel_names[c]);
     }
-    s->at++;
+    const char *channels = disti_saver_end(s, at);
     disti_saver_text(s, "format", "dist-net-1");
     if (net->activation == DIST_ACTIVATION_SOFTPLUS || net->activation == DIST_ACTIVATION_SINE)
         disti_saver_number(s, "dist.activation", activations[net->activation], (double)net->first_scale,
@@ -6356,9 +6330,8 @@ static void disti_saver_meta(disti_saver *s, const dist_net *net)
 DIST_API dist_status dist_net_save(dist_context *ctx, const dist_net *net, void *buffer, size_t capacity, size_t *size)
 {
     enum { MOST = 4 * DISTI_MAX_LAYERS + 1 };
-    static const char endings[4][8] = {".weight", ".bias", ".weight", ".bias"};
     disti_tensor_out tensors[MOST];
-    char names[MOST][16];
+    unsigned char names[MOST][16];
     disti_saver saver;
     size_t count = 0;
     dist_status status = disti_enter(ctx, "dist_net_save");
@@ -6370,12 +6343,8 @@ DIST_API dist_status dist_net_save(dist_context *ctx, const dist_net *net, void 
         const disti_linear *layer = &net->layer[l];
         size_t offsets[4] = {layer->weight, layer->bias, layer->norm_weight, layer->norm_bias};
         for (int i = 0; i < (net->normed && l + 1 < net->layers ? 4 : 2); i++) {
-            char *name = names[count];
-            size_t n = i < 2 ? 3 : 4;
-            memcpy(name, i < 2 ? "lin" : "norm", n);
-            n += disti_format_number(name + n, l, 6);
-            memcpy(name + n, endings[i], strlen(endings[i]) + 1);
-            tensors[count].name = name;
+            disti_tensor_name(names[count], "", i < 2 ? "lin" : "norm", l, i % 2 ? ".bias" : ".weight");
+            tensors[count].name = (const char *)names[count];
             tensors[count].rank = i == 0 ? 2 : 1;
             tensors[count].shape[0] = (size_t)layer->out;
             tensors[count].shape[1] = (size_t)layer->in;
@@ -10093,11 +10062,7 @@ static void disti_case_links(int code, unsigned char link[24])
     memset(link, 0xff, 24);
     for (int face = 0; face < 6; face++) {
         int axis = face >> 1, u = 1 << (axis + 1) % 3, v = 1 << (axis + 2) % 3, base = (face & 1) << axis;
-        int corner[4];
-        corner[0] = base;
-        corner[1] = base | ((face & 1) ? u : v);
-        corner[2] = base | u | v;
-        corner[3] = base | ((face & 1) ? v : u);
+        int corner[4] = {base, base | ((face & 1) ? u : v), base | u | v, base | ((face & 1) ? v : u)};
         for (int i = 0; i < 4; i++) {
             int j = i, next = corner[(i + 1) & 3];
             if (!(code >> corner[i] & 1) || (code >> next & 1)) continue;
@@ -10198,10 +10163,7 @@ static int disti_extract_mark(disti_extract *x, size_t slab)
     for (size_t from = 0; from < total; from += DISTI_MESH_BATCH) {
         size_t n = DISTI_MIN(total - from, (size_t)DISTI_MESH_BATCH);
         for (size_t i = 0; i < n; i++) {
-            size_t at[3];
-            at[0] = (from + i) % x->blocks;
-            at[1] = (from + i) / x->blocks;
-            at[2] = slab;
+            size_t at[3] = {(from + i) % x->blocks, (from + i) / x->blocks, slab};
             for (int k = 0; k < 3; k++)
                 x->batch[3 * i + (size_t)k] = disti_extract_coordinate(x, k, (double)(at[k] * x->block) + half);
         }
@@ -10252,11 +10214,8 @@ static int disti_extract_fill(disti_extract *x, int layer, size_t z)
 static int disti_extract_vertex(disti_extract *x, int edge, const size_t cell[3], unsigned *vertex)
 {
     int axis = edge >> 3, layer = edge >> 2 & 1;
-    size_t step[3], corner[3];
+    size_t step[3] = {1, x->side, 0}, corner[3];
     for (int k = 0; k < 3; k++) corner[k] = cell[k] + (size_t)(edge >> k & 1);
-    step[0] = 1;
-    step[1] = x->side;
-    step[2] = 0;
     size_t at = corner[1] * x->side + corner[0];
     unsigned *slot = axis == 2 ? x->upright + at : x->edge[layer][axis] + at;
     if (*slot == ~0u) {
@@ -10295,10 +10254,7 @@ static int disti_extract_layer(disti_extract *x, size_t z)
         size_t x0 = b % x->blocks * x->block, y0 = b / x->blocks * x->block;
         size_t width = DISTI_MIN(x->block, x->cells - x0), height = DISTI_MIN(x->block, x->cells - y0);
         for (size_t i = 0; i < width * height; i++) {
-            size_t cell[3];
-            cell[0] = x0 + i % width;
-            cell[1] = y0 + i / width;
-            cell[2] = z;
+            size_t cell[3] = {x0 + i % width, y0 + i / width, z};
             if (!disti_extract_cell(x, cell)) return 0;
         }
     }
@@ -10437,30 +10393,31 @@ DIST_API dist_mesh *dist_mesh_extract(dist_context *ctx, const dist_field *field
 {
     disti_extract x;
     disti_case cases[256];
-    int refine = desc ? desc->refine : 0, normals = desc ? desc->normals : 0, good = 0;
+    dist_mesh_desc d;
+    int good = 0;
     if (disti_enter(ctx, "dist_mesh_extract") != DIST_OK || disti_extract_check(ctx, field, desc) != DIST_OK)
         return NULL;
+    memset(&d, 0, sizeof d);
+    if (desc) d = *desc;
     memset(&x, 0, sizeof x);
     x.ctx = ctx;
     x.field = field;
     x.cases = cases;
-    x.level = desc ? desc->level : 0.0f;
-    x.cells = desc && desc->resolution ? (size_t)desc->resolution : 128;
+    x.level = d.level;
+    x.cells = d.resolution ? (size_t)d.resolution : 128;
     x.side = x.cells + 1;
-    x.no_skip = desc ? desc->no_skip : 0;
+    x.no_skip = d.no_skip;
     disti_extract_blocks(&x);
     disti_cases(cases);
     x.mesh = disti_mesh_new(ctx);
-    if (!x.mesh || !disti_extract_begin(&x) || !disti_extract_surface(&x)) goto done;
-    if (normals) {
+    good = x.mesh && disti_extract_begin(&x) && disti_extract_surface(&x);
+    if (good && d.normals) {
         x.mesh->normals = (float *)disti_alloc(ctx, x.mesh->vertex_capacity * 3 * sizeof(float)); /* as the vertices */
-        if (!x.mesh->normals) goto done;
+        good = x.mesh->normals != NULL;
     }
-    for (size_t at = 0; (refine || normals) && at < x.mesh->vertex_count; at += DISTI_MESH_BATCH)
-        disti_extract_polish(&x, DISTI_MIN(x.mesh->vertex_count - at, (size_t)DISTI_MESH_BATCH), refine,
-                             x.mesh->vertices + 3 * at, normals ? x.mesh->normals + 3 * at : NULL);
-    good = 1;
-done:
+    for (size_t at = 0; good && (d.refine || d.normals) && at < x.mesh->vertex_count; at += DISTI_MESH_BATCH)
+        disti_extract_polish(&x, DISTI_MIN(x.mesh->vertex_count - at, (size_t)DISTI_MESH_BATCH), d.refine,
+                             x.mesh->vertices + 3 * at, d.normals ? x.mesh->normals + 3 * at : NULL);
     disti_free(ctx, x.memory, x.memory_bytes);
     if (good) return x.mesh;
     dist_mesh_destroy(x.mesh);
@@ -10669,7 +10626,7 @@ static double disti_box_distance(const float *box, const float *p)
     return sum;
 }
 
-/* Looks for a point of the node nearer to p than *best, squared: its number goes to *hint. The nearer child is first. */
+/* Looks for a point of the node nearer to p than *best, squared: its number goes to *hint. Nearer children first. */
 static void disti_tree_search(const disti_tree *tree, size_t node, size_t low, size_t high, const float *p,
                               double *best, size_t *hint)
 {
@@ -11245,13 +11202,9 @@ static int disti_ply_value(disti_mesh_text *r, const disti_ply *ply, int type, d
     for (int i = 0; i < sizes[type]; i++) bits |= (uint64_t)(unsigned char)*t->at++ << 8 * i;
     uint32_t low = (uint32_t)(bits & 0xffffffffu);
     uint64_t sign = (uint64_t)1 << (8 * sizes[type] - 1);
-    if (type == 7) {
-        memcpy(out, &bits, sizeof bits);
-    } else if (type == 6) {
-        *out = disti_widen(low);
-    } else {
-        *out = (double)bits - ((type & 1) == 0 && (bits & sign) ? 2.0 * (double)sign : 0.0);
-    }
+    if (type == 7) memcpy(out, &bits, sizeof bits);
+    else if (type == 6) *out = disti_widen(low);
+    else *out = (double)bits - ((type & 1) == 0 && (bits & sign) ? 2.0 * (double)sign : 0.0);
     return 1;
 }
 
@@ -11343,10 +11296,9 @@ DIST_API dist_mesh *dist_mesh_read(dist_context *ctx, const void *bytes, size_t 
 /* Nine significant digits bring every float back. */
 static void disti_sink_decimal(disti_writer *sink, float number)
 {
-    char text[32];
     uint32_t bits;
     memcpy(&bits, &number, sizeof bits);
-    disti_put(sink, text, disti_format_number(text, disti_widen(bits), 9));
+    disti_put_number(sink, disti_widen(bits), 9);
 }
 
 static void disti_write_ply(disti_writer *sink, const dist_mesh *mesh)

@@ -396,6 +396,64 @@ TEST(photometric_gradient_reaches_code_and_cameras)
     dist_context_destroy(s.ctx);
 }
 
+/* The same through a placed shape: its code and the seven numbers of its similarity. */
+TEST(photometric_gradient_reaches_a_similarity)
+{
+    static sphere_pair s;
+    static float d_depth[SPHERE_PIXELS];
+    float truth[4] = {0.05f, 0, 0, 0.6f}, numbers[4] = {0.1f, 0.15f, -0.1f, 0.5f}, d_code[11], h = 5e-4f, largest = 0;
+    memset(d_code, 0, sizeof d_code);
+    memset(d_depth, 0, sizeof d_depth);
+    sphere_photos(&s, truth);
+    dist_field field = dist_field_sphere(numbers);
+    dist_instance instance;
+    memset(&instance, 0, sizeof instance);
+    instance.field = &field;
+    instance.placement.scale = 1.15f;
+    instance.placement.translation[0] = -0.07f;
+    instance.placement.translation[1] = -0.15f;
+    instance.placement.translation[2] = 0.1f;
+    dist_scene *scene = dist_scene_create(s.ctx, 1, &instance);
+    REQUIRE(scene);
+    CHECK_EQUAL(11, dist_scene_offset(scene, 1));
+    for (int k = -1; k < 11; k++) {
+        float value[2] = {0, 0}, kept[4];
+        memcpy(kept, numbers, sizeof kept);
+        for (int side = 0; side < (k < 0 ? 1 : 2); side++) {
+            dist_instance moved = instance;
+            float step[7] = {0, 0, 0, 0, 0, 0, 0};
+            if (k >= 4) step[k - 4] = side ? h : -h;
+            if (k >= 0 && k < 4) numbers[k] += side ? h : -h;
+            dist_similarity_move(&moved.placement, step);
+            CHECK_STATUS(DIST_OK, dist_scene_set(scene, 0, &moved), s.ctx);
+            dist_field placed = dist_scene_field(scene);
+            dist_images out, d_out;
+            memset(&out, 0, sizeof out);
+            memset(&d_out, 0, sizeof d_out);
+            for (int view = k < 0 ? 1 : 0; view >= 0; view--) { /* the other view's depth stays that of the middle */
+                out.depth = s.depth[view];
+                out.mask = s.mask[view];
+                CHECK_STATUS(DIST_OK, dist_render(s.ctx, &placed, &s.camera[view], NULL, &out, view ? NULL : s.tape),
+                             s.ctx);
+            }
+            value[side] = sphere_loss(&s, k < 0 ? d_depth : NULL, NULL);
+            memcpy(numbers, kept, sizeof kept);
+            if (k >= 0) continue;
+            dist_gradients grads;
+            memset(&grads, 0, sizeof grads);
+            grads.code = d_code;
+            d_out.depth = d_depth;
+            CHECK_STATUS(DIST_OK, dist_render_backward(s.ctx, s.tape, &d_out, &grads), s.ctx);
+            for (int j = 0; j < 11; j++) largest = fmaxf(largest, fabsf(d_code[j]));
+        }
+        if (k >= 0) CHECK_NEAR((value[1] - value[0]) / (2 * h), d_code[k], 0.02 * (double)largest);
+    }
+    CHECK(largest > 0.05f);
+    dist_scene_destroy(scene);
+    dist_tape_destroy(s.tape);
+    dist_context_destroy(s.ctx);
+}
+
 /* Behind the other camera, outside its picture, a depth that is no depth, a color that is no number. */
 TEST(what_the_other_view_cannot_see_does_not_count)
 {
@@ -569,6 +627,7 @@ int main(int argc, char **argv)
     RUN(photometric_camera_gradients_are_central_differences);
     RUN(photometric_loss_is_small_at_the_true_shape);
     RUN(photometric_gradient_reaches_code_and_cameras);
+    RUN(photometric_gradient_reaches_a_similarity);
     RUN(what_the_other_view_cannot_see_does_not_count);
     RUN(photometric_loss_of_bad_arguments_is_zero);
     RUN(photos_may_differ_in_size_and_be_one_pixel_wide);

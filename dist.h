@@ -7365,6 +7365,12 @@ typedef struct disti_budget {
     int marching;
 } disti_budget;
 
+/* Where the cones' axes over a block of 8 x 8 pixels had the least f: distance from the camera, f (3e38: no sample). */
+enum { DISTI_LEAST_BLOCK = 8, DISTI_LEASTS = (DISTI_TILE / DISTI_LEAST_BLOCK) * (DISTI_TILE / DISTI_LEAST_BLOCK) };
+typedef struct disti_least {
+    float t[DISTI_LEASTS], f[DISTI_LEASTS];
+} disti_least;
+
 typedef struct disti_bench { /* the work bench of one task */
     dist_stats *stats;
     disti_budget *budget; /* NULL: no limit */
@@ -7374,6 +7380,7 @@ typedef struct disti_bench { /* the work bench of one task */
     int *index;        /* DISTI_TILE_RAYS */
     unsigned char *rest; /* what else a task wants: DISTI_REST_BYTES */
     disti_balls *balls;  /* NULL: rays do not share */
+    disti_least *least_of;
     int width, height;   /* of the tile */
     float least;         /* smallest ball worth keeping */
 } disti_bench;
@@ -7390,6 +7397,7 @@ static void disti_bench_init(const dist_context *ctx, int worker, disti_bench *b
     bench->sdf = (float *)disti_take(base, &at, DISTI_TILE_RAYS, sizeof(float));
     bench->index = (int *)disti_take(base, &at, DISTI_TILE_RAYS, sizeof(int));
     bench->rest = (unsigned char *)disti_take(base, &at, DISTI_REST_BYTES, 1);
+    bench->least_of = (disti_least *)disti_take(base, &at, 1, sizeof(disti_least));
     bench->balls = NULL;
     bench->budget = NULL;
     bench->width = bench->height = 0;
@@ -7880,6 +7888,8 @@ typedef struct disti_cone {
     int blocked;
     int rays;     /* not done yet */
     float f;      /* last sample */
+    double least_t; /* where the block's axes had the least f, and that f */
+    float least_f;
 } disti_cone;
 
 /* A tile of the picture. Where the picture goes on, one more column and row are traced (never written), so that every
@@ -7941,6 +7951,10 @@ static int disti_cone_advance(const disti_tracer *tracer, disti_cone *cone, floa
     cone->blocked = 1;
     cone->f = f;
     if (!disti_finite(f)) return 0;
+    if (f < cone->least_f) {
+        cone->least_f = f;
+        cone->least_t = cone->t;
+    }
     float margin = tracer->epsilon > 0.0f ? tracer->epsilon : 5e-5f * tracer->field->radius;
     double radius = (double)disti_empty(tracer, f - margin);
     double wide = cone->t * cone->sine;
@@ -7957,6 +7971,14 @@ static int disti_cone_advance(const disti_tracer *tracer, disti_cone *cone, floa
 static void disti_cone_finish(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench,
                               const disti_cone *cone)
 {
+    for (int y = cone->y; y < DISTI_MIN(cone->y + cone->size, tile->own_height); y += DISTI_LEAST_BLOCK) {
+        for (int x = cone->x; x < DISTI_MIN(cone->x + cone->size, tile->own_width); x += DISTI_LEAST_BLOCK) {
+            int block = y / DISTI_LEAST_BLOCK * (DISTI_TILE / DISTI_LEAST_BLOCK) + x / DISTI_LEAST_BLOCK;
+            if (!(cone->least_f < bench->least_of->f[block])) continue;
+            bench->least_of->f[block] = cone->least_f;
+            bench->least_of->t[block] = (float)cone->least_t;
+        }
+    }
     for (int y = cone->y; y < disti_block_end(cone->y, cone->size, tile->own_height, tile->height); y++) {
         for (int x = cone->x; x < disti_block_end(cone->x, cone->size, tile->own_width, tile->width); x++) {
             disti_ray *ray = &bench->rays[y * tile->width + x];
@@ -8021,6 +8043,7 @@ static void disti_cones(const disti_tracer *tracer, int worker, const disti_tile
         for (int x = 0; x < tile->own_width; x += DISTI_CONE_FIRST) {
             cones[count].x = x;
             cones[count].y = y;
+            cones[count].least_f = 3e38f;
             cones[count++].size = DISTI_CONE_FIRST;
         }
     }
@@ -8040,6 +8063,8 @@ static void disti_cones(const disti_tracer *tracer, int worker, const disti_tile
                 child->x = cones[i].x + (k & 1 ? child->size : 0);
                 child->y = cones[i].y + (k & 2 ? child->size : 0);
                 child->t = cones[i].t;
+                child->least_t = cones[i].least_t;
+                child->least_f = cones[i].least_f;
                 children += child->x < tile->own_width && child->y < tile->own_height;
             }
         }
@@ -8200,10 +8225,11 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
     bench->balls = NULL;
 }
 
-/* Soft silhouette of the rays that miss: min |f| along each. Cones and stretched steps leave no sample near the
-   minimum, so it is looked for: one ray of each 4 x 4 block that has no sample samples its whole length; its
-   neighbors start at the distance found there; then every ray fits a parabola through three samples around its best
-   one. A value off by ds costs ds^2 / 2 times the curvature: first-order exact (envelope theorem). */
+/* Soft silhouette of the rays that miss: min |f| along each. Cones, balls and stretched steps leave no sample near the
+   minimum, so it is looked for. Nodes, every 8th and then every 4th pixel, fit a parabola around their least sample or
+   their block's (4 queries); between them the distance of the minimum is interpolated (1 query), far from the outline
+   f as well (none); near the outline a pixel also looks where its neighbors' minima are, and fits a parabola. A value
+   off by ds costs ds^2 / 2 times the curvature: first-order exact (envelope theorem). */
 static int disti_wants_minimum(const disti_ray *ray)
 {
     return ray->status == DIST_RAY_MISS && ray->enter < ray->leave;
@@ -8234,97 +8260,166 @@ static float disti_parabola(float h, float left, float middle, float right)
     return s > h ? h : s < -h ? -h : s;
 }
 
-enum { DISTI_PROBES = 8 };
-
-/* For each 4 x 4 block whose missing rays have no sample: probe one ray; leaves the distance from the camera in
-   t[block]. */
-static void disti_silhouette_probe(const disti_tracer *tracer, int worker, const disti_tile *tile,
-                                   const disti_bench *bench, double *t)
+/* Asks for f at s of ray `index`. */
+static size_t disti_silhouette_ask(const disti_bench *bench, int index, float s, size_t count)
 {
-    int across = (tile->width + 3) / 4, blocks = across * ((tile->height + 3) / 4);
-    size_t probes = 0;
-    for (int block = 0; block < blocks; block++) {
-        int found = -1;
-        for (int k = 0; k < 16 && found < 0; k++) {
-            int x = block % across * 4 + (k + 5) % 16 % 4, y = block / across * 4 + (k + 5) % 16 / 4;
-            if (x >= tile->width || y >= tile->height) continue;
-            const disti_ray *ray = &bench->rays[y * tile->width + x];
-            if (disti_wants_minimum(ray) && ray->fbest > 2e38f) found = y * tile->width + x;
-        }
-        t[block] = -1.0;
-        if (found < 0) continue;
-        disti_ray *ray = &bench->rays[found];
-        for (int k = 0; k < DISTI_PROBES; k++)
-            disti_ray_point(ray, ray->enter + (ray->leave - ray->enter) * ((float)k + 0.5f) / (float)DISTI_PROBES,
-                            bench->points + 3 * (probes * DISTI_PROBES + (size_t)k));
-        bench->index[2 * probes] = found;
-        bench->index[2 * probes + 1] = block;
-        probes++;
-    }
-    probes = disti_silhouette_eval(tracer, worker, bench, probes * DISTI_PROBES) / DISTI_PROBES;
-    for (size_t i = 0; i < probes; i++) {
-        disti_ray *ray = &bench->rays[bench->index[2 * i]];
-        const float *f = bench->sdf + i * DISTI_PROBES;
-        float h = (ray->leave - ray->enter) / (float)DISTI_PROBES;
-        int least = 0;
-        for (int k = 1; k < DISTI_PROBES; k++) least = f[k] < f[least] ? k : least;
-        float s = ray->enter + h * ((float)least + 0.5f);
-        disti_keep_least(ray, s, f[least]);
-        if (least > 0 && least + 1 < DISTI_PROBES) s += disti_parabola(h, f[least - 1], f[least], f[least + 1]);
-        t[bench->index[2 * i + 1]] = ray->base + (double)s;
+    disti_ray *ray = &bench->rays[index];
+    ray->q = DISTI_MIN(DISTI_MAX(s, ray->enter), ray->leave);
+    disti_ray_point(ray, ray->q, bench->points + 3 * count);
+    bench->index[count] = index;
+    return count + 1;
+}
+
+/* What the `count` samples asked for say; where the budget ends, none. */
+static void disti_silhouette_take(const disti_tracer *tracer, int worker, const disti_bench *bench, size_t count)
+{
+    count = disti_silhouette_eval(tracer, worker, bench, count);
+    for (size_t k = 0; k < count; k++) {
+        disti_ray *ray = &bench->rays[bench->index[k]];
+        disti_keep_least(ray, ray->q, bench->sdf[k]);
     }
 }
 
-static void disti_silhouette(const disti_tracer *tracer, int worker, const disti_tile *tile, const disti_bench *bench)
+/* Parabolas through three samples around the least one of the rays with width > 0: how far apart, in units of f. */
+static void disti_silhouette_fit(const disti_tracer *tracer, int worker, const disti_bench *bench, int n)
 {
-    double *t = (double *)(void *)bench->rest;
-    int n = tile->width * tile->height, across = (tile->width + 3) / 4;
-    float far = tracer->field->clamp > 0.0f ? 0.98f * tracer->field->clamp : 1e30f;
-    float near = tracer->field->clamp > 0.0f ? 0.2f * tracer->field->clamp : 1e30f; /* the outline's neighborhood */
-    size_t count = 0;
-    disti_silhouette_probe(tracer, worker, tile, bench, t);
-    for (int i = 0; i < n; i++) {
-        disti_ray *ray = &bench->rays[i];
-        double start = t[i / tile->width / 4 * across + i % tile->width / 4];
-        if (!disti_wants_minimum(ray) || start < 0.0 || ray->fbest < far) continue;
-        float s = (float)(start - ray->base);
-        ray->q = DISTI_MIN(DISTI_MAX(s, ray->enter), ray->leave);
-        disti_ray_point(ray, ray->q, bench->points + 3 * count);
-        bench->index[count++] = i;
-    }
-    count = disti_silhouette_eval(tracer, worker, bench, count);
-    for (size_t k = 0; k < count; k++)
-        disti_keep_least(&bench->rays[bench->index[k]], bench->rays[bench->index[k]].q, bench->sdf[k]);
-    for (int round = 0; round < 6; round++) { /* left, right, where the parabola is least; again, four times finer */
-        int phase = round % 3;
-        count = 0;
+    for (int phase = 0; phase < 3; phase++) { /* left, right, where the parabola is least */
+        size_t count = 0;
         for (int i = 0; i < n; i++) {
             disti_ray *ray = &bench->rays[i];
-            if (!disti_wants_minimum(ray)) continue;
-            if (phase == 0) { /* a: the best sample as it stood; width: the parabola's half width, 0: done */
-                float magnitude = ray->fbest < 0.0f ? -ray->fbest : ray->fbest;
-                float limit = round == 0 ? far : DISTI_MIN(far, near);
-                float width = DISTI_MAX(0.5f * magnitude, 2e-3f * tracer->field->radius);
-                ray->width = magnitude < limit ? (round == 0 ? width : 0.25f * width) : 0.0f;
+            if (!(ray->width > 0.0f)) continue;
+            if (phase == 0) { /* a: the least sample as it stood */
+                ray->width = DISTI_MAX(ray->width * ray->fbest, 2e-3f * tracer->field->radius);
                 ray->a = ray->best;
                 ray->fa = ray->fbest;
             }
-            if (!(ray->width > 0.0f)) continue;
             float ds = phase == 0   ? -ray->width
                        : phase == 1 ? ray->width
                                     : disti_parabola(ray->width, ray->b, ray->fa, ray->fb);
-            ray->q = DISTI_MIN(DISTI_MAX(ray->a + ds, ray->enter), ray->leave);
-            disti_ray_point(ray, ray->q, bench->points + 3 * count);
-            bench->index[count++] = i;
+            count = disti_silhouette_ask(bench, i, ray->a + ds, count);
         }
         size_t asked = disti_silhouette_eval(tracer, worker, bench, count);
-        for (size_t k = asked; k < count; k++) bench->rays[bench->index[k]].width = 0.0f;
-        for (size_t k = 0; k < asked; k++) {
+        for (size_t k = 0; k < count; k++) {
             disti_ray *ray = &bench->rays[bench->index[k]];
+            if (phase == 2 || k >= asked) ray->width = 0.0f;
+            if (k >= asked) continue;
             if (phase == 0) ray->b = bench->sdf[k];
             if (phase == 1) ray->fb = bench->sdf[k];
             disti_keep_least(ray, ray->q, bench->sdf[k]);
         }
+    }
+}
+
+enum { DISTI_NODE = 4 }; /* pixels between nodes; the tile's last row and column have some, too */
+
+static float disti_ray_distance(const disti_ray *ray)
+{
+    return (float)(ray->base + (double)ray->best);
+}
+
+/* The minimum of the ray at (x, y) interpolated from the nodes around it, h pixels apart: distance from the camera, and
+   f. Nodes whose own minimum is elsewhere on the ray (of another part of the shape) than the least one's are left out.
+   Returns how many of the four agree. */
+static int disti_silhouette_between(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench, int x,
+                                    int y, int h, float *t, float *f)
+{
+    int x0 = x / h * h, x1 = DISTI_MIN(x0 + h, tile->width - 1);
+    int y0 = y / h * h, y1 = DISTI_MIN(y0 + h, tile->height - 1);
+    float u = (float)(x - x0) / (float)DISTI_MAX(x1 - x0, 1), v = (float)(y - y0) / (float)DISTI_MAX(y1 - y0, 1);
+    const disti_ray *corner[4], *least = NULL;
+    float weight[4], sum = 0.0f;
+    int agree = 0;
+    for (int k = 0; k < 4; k++) {
+        corner[k] = &bench->rays[(k & 2 ? y1 : y0) * tile->width + (k & 1 ? x1 : x0)];
+        weight[k] = (k & 1 ? u : 1.0f - u) * (k & 2 ? v : 1.0f - v) + 1e-3f;
+        if (!disti_wants_minimum(corner[k]) || corner[k]->fbest > 2e38f) corner[k] = NULL;
+        else if (!least || corner[k]->fbest < least->fbest) least = corner[k];
+    }
+    *t = *f = 0.0f;
+    for (int k = 0; k < 4; k++) {
+        if (!corner[k]) continue;
+        float at = disti_ray_distance(corner[k]), off = at - disti_ray_distance(least);
+        if ((off < 0.0f ? -off : off) > 0.1f * tracer->field->radius) continue;
+        *t += weight[k] * at;
+        *f += weight[k] * corner[k]->fbest;
+        sum += weight[k];
+        agree++;
+    }
+    if (agree) *t /= sum;
+    if (agree) *f /= sum;
+    return agree;
+}
+
+static int disti_silhouette_node(const disti_tile *tile, int x, int y, int h)
+{
+    return (x % h == 0 || x == tile->width - 1) && (y % h == 0 || y == tile->height - 1);
+}
+
+static void disti_silhouette(const disti_tracer *tracer, int worker, const disti_tile *tile, const disti_bench *bench)
+{
+    int n = tile->width * tile->height, w = tile->width;
+    float radius = tracer->field->radius, clamp = tracer->field->clamp;
+    float pixel = disti_pixel_width(tracer, tile);
+    /* where f between nodes, of curvature 1 / f, is off by about (4 pixels)^2 / 8 f = 1e-3 radii */
+    float far = DISTI_MIN(DISTI_MAX(0.05f, 1.5e3f * (pixel / radius) * (pixel / radius)) * radius,
+                          clamp > 0.0f ? 0.98f * clamp : 3e38f);
+    float near = pixel > 0.01f * radius ? far : 0.01f * radius; /* coarse pixels: nothing is near enough to share */
+    for (int i = 0; i < n; i++) bench->rays[i].width = 0.0f;
+    for (int h = 2 * DISTI_NODE; h >= 1; h = h == DISTI_NODE ? 1 : h / 2) {
+        size_t count = 0;
+        for (int i = 0; i < n; i++) {
+            disti_ray *ray = &bench->rays[i];
+            int x = i % w, y = i / w, agree = 0, up = h == 1 ? (int)DISTI_NODE : 2 * h; /* nodes known, up apart */
+            int block = y / DISTI_LEAST_BLOCK * (DISTI_TILE / DISTI_LEAST_BLOCK) + x / DISTI_LEAST_BLOCK;
+            float t = bench->least_of->t[block], f = bench->least_of->f[block];
+            if (!disti_wants_minimum(ray) || !disti_silhouette_node(tile, x, y, h)) continue;
+            if (h < 2 * DISTI_NODE) {
+                if (disti_silhouette_node(tile, x, y, up)) continue;
+                float between = 0.0f, value = 0.0f;
+                agree = disti_silhouette_between(tracer, tile, bench, x, y, up, &between, &value);
+                if (agree) t = between;
+                if (agree) f = value;
+            }
+            float s = f < 2e38f ? (float)((double)t - ray->base) : 0.0f;
+            if (agree == 4 && f > far && h == 1) disti_keep_least(ray, s, f);
+            else if (agree || h == 2 * DISTI_NODE || ray->fbest > 2e38f)
+                count = disti_silhouette_ask(bench, i, s, count);
+            if (h > 1) ray->width = h == DISTI_NODE ? 0.35f : 0.7f;
+        }
+        disti_silhouette_take(tracer, worker, bench, count);
+        if (h == 1) break;
+        for (int i = 0; i < n; i++)
+            if (h == DISTI_NODE && bench->rays[i].fbest > far) bench->rays[i].width = 0.0f;
+        disti_silhouette_fit(tracer, worker, bench, n);
+        if (h == DISTI_NODE) continue;
+        for (int i = 0; i < n; i++) /* the cones' samples are far apart: once more */
+            if (disti_silhouette_node(tile, i % w, i / w, h) && disti_wants_minimum(&bench->rays[i]))
+                bench->rays[i].width = 0.35f;
+        disti_silhouette_fit(tracer, worker, bench, n);
+    }
+    for (int round = 0; round < 2; round++) {
+        size_t count = 0;
+        for (int i = 0; i < n; i++) {
+            disti_ray *ray = &bench->rays[i];
+            const disti_ray *best = ray;
+            if (!disti_wants_minimum(ray) || ray->fbest > (round == 0 ? far : near)) continue;
+            for (int k = 0; k < 4; k++) {
+                int x = i % w + (k == 0) - (k == 1), y = i / w + (k == 2) - (k == 3);
+                if (x < 0 || y < 0 || x >= w || y >= tile->height) continue;
+                const disti_ray *other = &bench->rays[y * w + x];
+                if (disti_wants_minimum(other) && other->fbest < best->fbest) best = other;
+            }
+            float away = disti_ray_distance(best) - disti_ray_distance(ray);
+            if (away * away > 4e-4f * radius * radius)
+                count = disti_silhouette_ask(bench, i, (float)((double)disti_ray_distance(best) - ray->base), count);
+        }
+        disti_silhouette_take(tracer, worker, bench, count);
+    }
+    for (int fine = 0; fine <= (pixel > 0.01f * radius); fine++) {
+        for (int i = 0; i < n; i++)
+            if (disti_wants_minimum(&bench->rays[i]) && bench->rays[i].fbest < near)
+                bench->rays[i].width = fine ? 0.1f : 0.35f;
+        disti_silhouette_fit(tracer, worker, bench, n);
     }
 }
 
@@ -8912,6 +9007,7 @@ static void disti_render_task(void *arg, int index, int worker)
     {
         unsigned long long kept = job->least ? budget.left / 4 : 0; /* for the smallest f of misses */
         budget.left -= kept;
+        for (int i = 0; i < DISTI_LEASTS; i++) bench.least_of->f[i] = 3e38f;
         if (!tracer->how.no_cones)
             disti_cones(tracer, worker, &tile, &bench, predict ? (int)DISTI_LATTICE : (int)DISTI_CONE_LEAF);
         budget.marching = 1;

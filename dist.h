@@ -289,8 +289,8 @@ typedef struct dist_instance {
 /* Several instances as one field: f(p) = min over i of s_i f_i(R_i^T (p - t_i) / s_i). A point asks only the instances
    whose bounding spheres can hold the minimum, nearest first, and none of them outside its sphere: there f_i goes on as
    a lower bound of the distance, exact up to a fifth of the sphere's radius. Defaults that go by the bounding radius
-   (how.epsilon) go by the scene's. Every point is held against every sphere: fast up to some hundred instances; more are
-   better made scenes of scenes. Belongs to the context that made it. */
+   (how.epsilon) go by the scene's. Every point is held against every sphere: fast up to some hundred instances; more
+   are better made scenes of scenes. Belongs to the context that made it. */
 typedef struct dist_scene dist_scene;
 /* NULL on failure. Instances may share fields; a scene's field may be an instance of another scene. */
 DIST_API dist_scene *dist_scene_create(dist_context *ctx, int count, const dist_instance *instances);
@@ -7694,8 +7694,8 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
 }
 
 /* Nearest points and contacts. From x on the surface a share of the way back to p and down to the surface again,
-   x' = P(x + share (p - x)): stays where x is nearest, in creases too, and cannot overshoot where the surface bends away;
-   P, steps of Newton along the gradient, is where it is a distance's own foot. Half the share where that came no
+   x' = P(x + share (p - x)): stays where x is nearest, in creases too, and cannot overshoot where the surface bends
+   away; P, steps of Newton along the gradient, is where it is a distance's own foot. Half the share where that came no
    nearer. */
 typedef struct disti_foot {
     float p[3], x[3];
@@ -9108,7 +9108,7 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     if (status != DIST_OK) return status;
     if (!out) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: out is NULL", name, 0, 0);
     if (tracer.how.any_hit || tracer.how.max_distance > 0.0f)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.any_hit and how.max_distance are for dist_trace", name, 0, 0);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.any_hit and max_distance are for dist_trace", name, 0, 0);
     if (out->color && !field->color_fn)
         return disti_fail(ctx, DIST_UNSUPPORTED, "%s: out.color is wanted, but the field has no color", name, 0, 0);
     if (tape && tape->ctx != ctx)

@@ -401,7 +401,7 @@ static const float *result_group(const result *r, int group)
 }
 
 /* Largest derivative by the camera's translation: what a rotation, which moves points within the unit sphere, is
-   measured by when its own derivative cancels. */
+   measured by when its own derivative cancels; so with the lens. */
 static double pull_size(scene *s, double (*loss_fn)(const scene *, const void *), const void *job)
 {
     const double h = 1e-6;
@@ -429,7 +429,9 @@ static void compare_group(scene *s, int group, const result *got, double (*loss_
     const double h = 1e-6;
     test_random random = test_random_seed(33);
     if (n == 0) return;
-    if (group == ROTATION) floor_size = pull_size(s, loss_fn, job);
+    if (group >= ROTATION && group <= PRINCIPAL) floor_size = pull_size(s, loss_fn, job);
+    /* what a point 2 away, 0.3 off the axis, feels of the lens */
+    if (group == FOCAL || group == PRINCIPAL) floor_size *= (group == FOCAL ? 0.3 : 1.0) * 2.0 / s->focal[0];
     /* numbers that do not matter, as the last bias where a held point's normal is looked at, differ by rounding */
     if (group == CODE || group == WEIGHTS) floor_size = 1e-2 * pull_size(s, loss_fn, job);
     begin[0] = 0;

@@ -4541,7 +4541,7 @@ static void disti_encode_backward(const dist_net *net, const disti_block *b, flo
 {
     const float *rows = b->point, *d_rows = b->d_point;
     size_t half = (size_t)b->half;
-    for (size_t c = 0; c < (half ? half : DISTI_BLOCK); c++) {
+    for (size_t c = 0; c < (half ? half : (size_t)DISTI_BLOCK); c++) {
         for (int axis = 0; axis < 3; axis++) {
             float sum = net->raw ? d_rows[(size_t)axis * DISTI_BLOCK + c] : 0.0f;
             float factor = (float)net->base;
@@ -4583,7 +4583,7 @@ static void disti_norm(int units, float epsilon, const float *gamma, const float
                        float *DISTI_RESTRICT x, float *DISTI_RESTRICT hat, float *DISTI_RESTRICT inverse)
 {
     float mean[DISTI_BLOCK], variance[DISTI_BLOCK];
-    size_t count = (size_t)units, lanes = half ? half : DISTI_BLOCK;
+    size_t count = (size_t)units, lanes = half ? half : (size_t)DISTI_BLOCK;
     for (size_t c = 0; c < lanes; c++) mean[c] = variance[c] = 0.0f;
     for (size_t u = 0; u < count; u++)
         for (size_t c = 0; c < lanes; c++) mean[c] += x[u * DISTI_BLOCK + c];
@@ -4620,7 +4620,7 @@ static void disti_norm_backward(int units, const float *gamma, size_t half, cons
     float along[DISTI_BLOCK], cross[DISTI_BLOCK];
     size_t count = (size_t)units * DISTI_BLOCK;
     for (size_t u = 0; u < count; u++) d[u] *= gamma[u / DISTI_BLOCK];
-    disti_norm_project(units, half ? half : DISTI_BLOCK, hat, inverse, d, along);
+    disti_norm_project(units, half ? half : (size_t)DISTI_BLOCK, hat, inverse, d, along);
     if (!half) return;
     memset(cross, 0, sizeof cross);
     for (size_t u = half; u < count; u += DISTI_BLOCK)
@@ -4824,7 +4824,7 @@ static void disti_net_output(const dist_shape *shape, const disti_block *b, cons
     float bias = shape->bias[(size_t)l * (size_t)net->max_rows + (size_t)channel];
     kernels.dot(net->panels + layer->panel + (size_t)channel * (size_t)rows, b->half ? 0.0f : bias, x, alive,
                 b->alive_count[l], rows, b->columns, value);
-    for (size_t c = 0; c < (b->half ? (size_t)b->half : DISTI_BLOCK); c++) {
+    for (size_t c = 0; c < (size_t)(b->half ? b->half : DISTI_BLOCK); c++) {
         float v = b->half ? value[c] + bias : value[c], d = 1.0f, bend = 0.0f;
         int twice = net->output == DISTI_OUTPUT_TANH_TWICE;
         slope[c] = 0.0f;
@@ -5386,7 +5386,7 @@ static void disti_weights_block(void *arg, int index, int worker)
         disti_encode_backward(net, &b, g);
         pull = g;
     }
-    disti_weights_drop(net, job->directions ? DISTI_BLOCK : count, store);
+    disti_weights_drop(net, job->directions ? (size_t)DISTI_BLOCK : count, store);
     for (size_t i = 0; job->d_points && i < 3 * count; i++) job->d_points[3 * at + i] += pull[i];
     if (!job->d_code) return;
     memset(b.fold_sum, 0, (size_t)net->fold_count * (size_t)net->max_rows * sizeof(double));
@@ -5414,7 +5414,7 @@ static void disti_weights_rows(const disti_weights_job *job, int l, size_t o, si
     const float *delta = store + disti_store_offset(net, l, DISTI_STORE_DELTA) + o * DISTI_BLOCK;
     size_t row = l + 1 == net->layers ? (size_t)disti_weights_channel(job) : o;
     size_t values = DISTI_MIN(job->n - job->first - (size_t)index * job->block, job->block);
-    size_t columns = job->directions ? DISTI_BLOCK : values; /* tangents have no share in the bias */
+    size_t columns = job->directions ? (size_t)DISTI_BLOCK : values; /* tangents have no share in the bias */
     float *w = job->d_weights + layer->weight + row * (size_t)layer->in;
     disti_gemm_weights g;
     g.d_y = delta;
@@ -10934,6 +10934,7 @@ static dist_status disti_pfm_parse(dist_context *ctx, const char *label, const v
     disti_text t;
     int64_t side[2];
     double scale = 0.0;
+    memset(pfm, 0, sizeof *pfm);
     t.at = (const char *)bytes;
     t.end = t.at + size;
     if (size < 3 || t.at[0] != 'P' || (t.at[1] != 'f' && t.at[1] != 'F') || !disti_is_space(t.at[2]))

@@ -47,7 +47,7 @@
 #define DIST_H
 
 #define DIST_VERSION_MAJOR 0
-#define DIST_VERSION_MINOR 1
+#define DIST_VERSION_MINOR 2
 #define DIST_VERSION_PATCH 0
 
 #include <stddef.h>
@@ -85,7 +85,7 @@ enum {
     DIST_IO = -6             /* a file cannot be opened, read or written */
 };
 
-/* "0.1.0" */
+/* "0.2.0" */
 DIST_API const char *dist_version(void);
 
 /* Memory. alloc_fn returns `bytes` bytes aligned to `alignment` (a power of two, at most 64) or NULL; free_fn gets the
@@ -787,7 +787,7 @@ extern "C" {
 
 DIST_API const char *dist_version(void)
 {
-    return "0.1.0";
+    return "0.2.0";
 }
 
 /* Looks at the bits: -ffast-math removes a test of the value. */
@@ -7448,20 +7448,20 @@ static void disti_publish(const disti_tracer *tracer, const disti_bench *bench, 
 /* Adds [from, to] to what is covered; where all places are taken the farthest part gives way. */
 static void disti_cover_add(disti_cover *cover, float from, float to)
 {
-    int free = -1, farthest = 0;
+    int place = -1, farthest = 0;
     for (int i = 0; i < DISTI_COVERS; i++) {
         if (cover->to[i] >= from && cover->from[i] <= to) { /* they meet: one */
             from = DISTI_MIN(from, cover->from[i]);
             to = DISTI_MAX(to, cover->to[i]);
             cover->to[i] = -3e38f;
         }
-        if (cover->to[i] < -1e38f) free = i;
+        if (cover->to[i] < -1e38f) place = i;
         else if (cover->from[i] > cover->from[farthest]) farthest = i;
     }
-    if (free < 0 && cover->from[farthest] <= from) return;
-    if (free < 0) free = farthest;
-    cover->from[free] = from;
-    cover->to[free] = to;
+    if (place < 0 && cover->from[farthest] <= from) return;
+    if (place < 0) place = farthest;
+    cover->from[place] = from;
+    cover->to[place] = to;
 }
 
 /* How far along the ray the balls around it cover it without a gap, from s on. */

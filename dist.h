@@ -5438,7 +5438,8 @@ static void disti_weights_rows(const disti_weights_job *job, int l, size_t o, si
             to[(size_t)layer->point_column + k] += s;
         }
         for (size_t j = 0; j < (size_t)layer->code; j++)
-            to[(size_t)layer->code_column + j] += layer->scale * sum * shape->code[j];
+            disti_add_gradient(&to[(size_t)layer->code_column + j],
+                               (double)layer->scale * (double)sum * (double)shape->code[j]);
     }
     if (!net->normed || l + 1 == net->layers) return;
     const float *sums = store + disti_store_offset(net, l, DISTI_STORE_NORM);
@@ -7184,7 +7185,8 @@ static int disti_ray_inside(const disti_tracer *tracer, disti_ray *ray, float f)
     ray->f = -f;
     ray->best = ray->enter;
     ray->fbest = f;
-    ray->slope = 0.0f;
+    ray->slope = ray->fb = 0.0f; /* what was found beyond was so with the other sign */
+    ray->known = 0;
     return disti_ray_step(tracer, ray);
 }
 
@@ -7311,13 +7313,16 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
             if (left <= (tracer->how.certified ? spacing : 1e-3f * tracer->field->radius))
                 return disti_ray_open_bracket(tracer, ray, q, f, ray->b, ray->fb);
         }
-        ray->slope = (f - ray->f) / step;
+        float clamp = tracer->field->clamp > 0.0f ? 0.98f * tracer->field->clamp : 3e38f;
+        int clamped = f > clamp || ray->f > clamp; /* then no slope is known, and none foretells a surface */
+        ray->slope = clamped ? DISTI_MAX((f - ray->f) / step, 0.0f) : (f - ray->f) / step;
         ray->s = q;
         ray->f = f;
         ray->known = 1;
         if (ray->fb > 0.0f && ray->b > q &&
             ray->b - q <= disti_empty(tracer, f) + disti_empty(tracer, ray->fb)) { /* the gap is closed */
-            ray->slope = (ray->fb - f) / (ray->b - q);
+            clamped = f > clamp || ray->fb > clamp;
+            ray->slope = clamped ? DISTI_MAX((ray->fb - f) / (ray->b - q), 0.0f) : (ray->fb - f) / (ray->b - q);
             ray->s = ray->b;
             ray->f = ray->fb;
         }
@@ -7550,10 +7555,15 @@ static void disti_trace_all(const disti_tracer *tracer, int worker, const disti_
 }
 
 /* Ends the rays for which no budget was left. */
-static void disti_trace_end(const disti_bench *bench, size_t n)
+static void disti_trace_end(const disti_tracer *tracer, const disti_bench *bench, size_t n)
 {
-    for (size_t i = 0; i < n && bench->budget; i++)
-        if (bench->rays[i].mode != DISTI_DONE) disti_ray_give_up(&bench->rays[i]);
+    unsigned long long hits = 0;
+    for (size_t i = 0; i < n && bench->budget; i++) {
+        disti_ray *ray = &bench->rays[i];
+        if (ray->mode != DISTI_DONE) disti_ray_give_up(ray);
+        if (!disti_ray_is_hit(tracer, ray)) continue; /* one without a query of its own may find nothing left for it */
+        if (++hits * bench->budget->per_hit > bench->budget->left) ray->status = DIST_RAY_UNRESOLVED;
+    }
 }
 
 static void disti_stats_begin(dist_context *ctx)
@@ -7592,7 +7602,7 @@ static void disti_stats_end(dist_context *ctx, const disti_tracer *tracer, dist_
         out->not_finite += s->not_finite;
         out->operations += disti_counter_of(ctx, worker)->dense;
         out->operations_done += disti_counter_of(ctx, worker)->done;
-        out->error = DISTI_MAX(out->error, s->error);
+        if (s->error > out->error) out->error = s->error; /* not -0 over 0, which would tell the workers' order */
         if (s->epsilon > 0.0f) out->epsilon = DISTI_MIN(out->epsilon, s->epsilon);
     }
     if (out->epsilon > 1e38f) out->epsilon = tracer->epsilon > 0.0f ? tracer->epsilon : 5e-5f * tracer->field->radius;
@@ -7611,7 +7621,7 @@ static void disti_stats_ray(const disti_tracer *tracer, const disti_ray *ray, di
     stats->not_finite += ray->status == DIST_RAY_NOT_FINITE;
     if (ray->status != DIST_RAY_HIT) return;
     float epsilon = disti_ray_epsilon(tracer, ray, ray->best);
-    stats->error = DISTI_MAX(stats->error, ray->error);
+    if (ray->error > stats->error) stats->error = ray->error;
     stats->epsilon = stats->epsilon > 0.0f ? DISTI_MIN(stats->epsilon, epsilon) : epsilon;
 }
 
@@ -7655,7 +7665,7 @@ static void disti_free_task(void *arg, int index, int worker)
                   disti_share(job->tracer, (double)first, (double)job->n);
     if (job->tracer->how.max_queries > 0) bench.budget = &budget;
     disti_trace_all(job->tracer, worker, &bench, n);
-    disti_trace_end(&bench, n);
+    disti_trace_end(job->tracer, &bench, n);
     for (size_t i = 0; i < n; i++) {
         const disti_ray *ray = &bench.rays[i];
         dist_hit *hit = job->hits + first + i;
@@ -8602,13 +8612,9 @@ static void disti_paper_trace(const disti_tracer *tracer, int worker, const dist
             disti_paper_step(tracer, &bench->rays[i], mine, alpha, bench->sdf[k], bench->points + 3 * k);
         }
     }
-    unsigned long long hits = 0;
-    for (size_t i = 0; i < n; i++) {
-        disti_ray *ray = &bench->rays[i];
-        if (ray->mode != DISTI_DONE) disti_paper_finish(tracer, ray);
-        if (!bench->budget || !disti_ray_is_hit(tracer, ray)) continue;
-        if (++hits * bench->budget->per_hit > bench->budget->left) ray->status = DIST_RAY_UNRESOLVED;
-    }
+    for (size_t i = 0; i < n; i++)
+        if (bench->rays[i].mode != DISTI_DONE) disti_paper_finish(tracer, &bench->rays[i]);
+    disti_trace_end(tracer, bench, n);
 }
 #endif
 
@@ -9015,7 +9021,7 @@ static void disti_render_task(void *arg, int index, int worker)
         else disti_trace_all(tracer, worker, &bench, (size_t)n);
         budget.marching = 0;
         disti_tile_trim(&tile, &bench);
-        disti_trace_end(&bench, (size_t)(tile.width * tile.height));
+        disti_trace_end(tracer, &bench, (size_t)(tile.width * tile.height));
         budget.left += kept;
         if (job->least) disti_silhouette(tracer, worker, &tile, &bench);
     }
@@ -9078,7 +9084,7 @@ static void disti_render_list_task(void *arg, int index, int worker)
         budget.marching = 1;
         done += (double)tile.width;
         disti_trace_all(tracer, worker, &bench, (size_t)tile.width);
-        disti_trace_end(&bench, (size_t)tile.width);
+        disti_trace_end(tracer, &bench, (size_t)tile.width);
         disti_render_planes(job, &tile, &bench);
         if (job->out->normal) disti_render_normals(job, worker, &tile, &bench);
         if (job->out->color) disti_render_colors(job, worker, &tile, &bench);

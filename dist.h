@@ -7109,6 +7109,10 @@ static int disti_ray_step(const disti_tracer *tracer, disti_ray *ray)
     }
     float q = ray->s + step;
     float spacing = ray->s + 2.4e-7f * tracer->field->radius;
+    if (ray->fb > 0.0f && ray->b > ray->s && q > ray->b) { /* into the gap before the sample beyond, not past it */
+        q = 0.5f * (ray->s + radius + ray->b - disti_empty(tracer, ray->fb));
+        mode = DISTI_MARCH;
+    }
     q = DISTI_MAX(q, spacing);
     return disti_ray_ask(ray, mode, DISTI_MIN(q, ray->leave));
 }

@@ -765,6 +765,20 @@ extern "C" {
 #define DISTI_KERNEL
 #endif
 
+/* Plain loops that are to become vectors: gcc does that at -O3 only, and selects only where no comparison may trap. */
+#if defined(__GNUC__) && !defined(__clang__)
+#define DISTI_LOOPS __attribute__((optimize("O3,no-trapping-math,no-math-errno")))
+#else
+#define DISTI_LOOPS
+#endif
+#if defined(__GNUC__) || defined(__clang__)
+#define DISTI_INLINE static inline __attribute__((always_inline))
+#elif defined(_MSC_VER)
+#define DISTI_INLINE static __forceinline
+#else
+#define DISTI_INLINE static inline
+#endif
+
 #if !defined(DIST_NO_SIMD) && (defined(__x86_64__) || defined(_M_X64)) &&                                              \
     (defined(__GNUC__) || defined(__clang__) || defined(_MSC_VER))
 #define DISTI_X86
@@ -1418,6 +1432,13 @@ typedef struct disti_kernels {
     /* y[k][c] = (bit c of mask[k]) * w[k] s[c] for the listed rows (NULL: all): its adjoint */
     void (*outer)(const float *w, const float *s, const int *alive, int alive_count, int rows, int columns,
                   const uint64_t *mask, float *y);
+    /* y <- max(0, y) and the bits of the positive lanes of each row */
+    void (*relu)(size_t rows, float *y, uint64_t *mask);
+    /* y <- activation(y), n values; slope (n) gets its derivative unless NULL */
+    void (*activate)(int activation, float scale, size_t n, float *y, float *slope);
+    /* LayerNorm of a block: disti_norm_lanes over all lanes */
+    void (*norm)(int units, float epsilon, const float *gamma, const float *beta, float *x, float *hat, float *inverse);
+    void (*norm_back)(int units, const float *gamma, size_t half, const float *hat, const float *inverse, float *d);
 } disti_kernels;
 
 /* The scalar kernels are the definition; the others are measured against them. */
@@ -1500,6 +1521,257 @@ static void disti_outer_scalar(const float *w, const float *s, const int *alive,
     }
 }
 
+/* exp to 2 ulp; below -87 it is 0, above 88 the largest float. */
+DISTI_INLINE float disti_exp(float x)
+{
+    x = x < 88.0f ? x : 88.0f; /* also for NaN, which may stand in idle lanes */
+    x = x > -87.0f ? x : -87.0f;
+    float n = x * 1.44269504f;
+    int32_t k = (int32_t)(n < 0.0f ? n - 0.5f : n + 0.5f);
+    n = (float)k;
+    float r = x - n * 0.693359375f;
+    r += n * 2.12194440e-4f;
+    float p = 1.9875691500e-4f;
+    p = p * r + 1.3981999507e-3f;
+    p = p * r + 8.3334519073e-3f;
+    p = p * r + 4.1665795894e-2f;
+    p = p * r + 1.6666665459e-1f;
+    p = p * r + 5.0000001201e-1f;
+    p = p * r * r + r + 1.0f;
+    uint32_t bits = (uint32_t)(k + 127) << 23;
+    float scale;
+    memcpy(&scale, &bits, sizeof scale);
+    return p * scale;
+}
+
+DISTI_INLINE float disti_tanh(float x)
+{
+    float a = x < 0.0f ? -x : x;
+    float s = x * x;
+    float small = x + x * s * ((((-5.70498872745e-3f * s + 2.06390887954e-2f) * s - 5.37397155531e-2f) * s +
+                                1.33314422036e-1f) * s - 3.33332819422e-1f);
+    float large = 1.0f - 2.0f / (disti_exp(2.0f * (a > 20.0f ? 20.0f : a)) + 1.0f);
+    large = x < 0.0f ? -large : large;
+    return a < 0.625f ? small : large;
+}
+
+DISTI_INLINE float disti_sigmoid(float x)
+{
+    float e = disti_exp(x < 0.0f ? x : -x);
+    return (x < 0.0f ? e : 1.0f) / (1.0f + e);
+}
+
+/* Their derivatives, by e = exp(-2 |x|) and exp(-|x|): relatively exact where 1 - tanh^2 would have cancelled to
+   nothing. */
+DISTI_INLINE float disti_tanh_slope(float x)
+{
+    float e = disti_exp(x < 0.0f ? 2.0f * x : -2.0f * x);
+    return 4.0f * e / ((1.0f + e) * (1.0f + e));
+}
+
+DISTI_INLINE float disti_sigmoid_slope(float x)
+{
+    float e = disti_exp(x < 0.0f ? x : -x);
+    return e / ((1.0f + e) * (1.0f + e));
+}
+
+/* log(1 + exp(-a)), a >= 0: the smooth part of softplus, by 2 atanh(u / (2 + u)). */
+DISTI_INLINE float disti_log1p_exp(float a)
+{
+    float u = disti_exp(-a);
+    float s = u / (2.0f + u);
+    float q = s * s;
+    return 2.0f * s *
+           (1.0f +
+            q * (1.0f / 3 + q * (1.0f / 5 + q * (1.0f / 7 + q * (1.0f / 9 + q * (1.0f / 11 + q * (1.0f / 13)))))));
+}
+
+/* Sine and cosine of a double, range-reduced by multiples of pi / 2 in two parts: full float accuracy up to 1e9, 0 beyond, and
+   values in [-1, 1] for anything finite. */
+DISTI_INLINE void disti_sincos(double x, double *sine, double *cosine)
+{
+    x = x > -1e9 ? x : 0.0;
+    x = x < 1e9 ? x : 0.0;
+    double q = x * 0.63661977236758134308;
+    int32_t k = (int32_t)(q < 0 ? q - 0.5 : q + 0.5);
+    double r = (x - (double)k * 1.57079632673412561417) - (double)k * 6.07710050650619224932e-11;
+    double s = r * r;
+    double sn = r + r * s *
+                        (-1.66666666666666324348e-1 +
+                         s * (8.33333333332248946124e-3 +
+                              s * (-1.98412698298579493134e-4 +
+                                   s * (2.75573137070700676789e-6 + s * -2.50507602534068634195e-8))));
+    double cs = 1.0 - s * (0.5 - s * (4.16666666666666019037e-2 - s * (1.38888888888741095749e-3 -
+                s * (2.48015872894767294178e-5 - s * 2.75573143513906633035e-7))));
+    double a = (k & 1) ? cs : sn, b = (k & 1) ? sn : cs;
+    *sine = (k & 2) ? -a : a;
+    *cosine = ((k + 1) & 2) ? -b : b;
+}
+
+/* activation(x), *slope gets its derivative. scale: softplus's beta, sine's omega. */
+DISTI_INLINE float disti_activate_one(int activation, float scale, float x, float *slope)
+{
+    float v = x, d = 1.0f;
+    switch (activation) {
+    case DIST_ACTIVATION_RELU:
+        d = x > 0.0f ? 1.0f : 0.0f;
+        v = x > 0.0f ? x : 0.0f;
+        break;
+    case DIST_ACTIVATION_ELU: {
+        float near_zero = x * (1.0f + x * (0.5f + x * (1.0f / 6 + x * (1.0f / 24 + x * (1.0f / 120)))));
+        float below = disti_exp(x) - 1.0f;
+        below = x > -0.1f ? near_zero : below;
+        v = x > 0.0f ? x : below;
+        d = x > 0.0f ? 1.0f : below + 1.0f;
+        break;
+    }
+    case DIST_ACTIVATION_SOFTPLUS: {
+        float a = scale * x;
+        v = (x > 0.0f ? x : 0.0f) + disti_log1p_exp(a < 0.0f ? -a : a) / scale;
+        d = disti_sigmoid(a);
+        break;
+    }
+    case DIST_ACTIVATION_SINE: {
+        double s, c;
+        disti_sincos((double)scale * (double)x, &s, &c);
+        v = (float)s;
+        d = (float)((double)scale * c);
+        break;
+    }
+    case DIST_ACTIVATION_TANH:
+        v = disti_tanh(x);
+        d = disti_tanh_slope(x);
+        break;
+    case DIST_ACTIVATION_NONE: break;
+    }
+    *slope = d;
+    return v;
+}
+
+DISTI_INLINE void disti_activate_loop(int activation, float scale, size_t n, float *DISTI_RESTRICT y,
+                                      float *DISTI_RESTRICT slope)
+{
+    float d;
+    if (slope)
+        for (size_t i = 0; i < n; i++) y[i] = disti_activate_one(activation, scale, y[i], slope + i);
+    else
+        for (size_t i = 0; i < n; i++) y[i] = disti_activate_one(activation, scale, y[i], &d);
+}
+
+/* y <- activation(y), n values; slope (n) gets its derivative unless NULL. */
+DISTI_INLINE void disti_activate(int activation, float scale, size_t n, float *y, float *slope)
+{
+    switch (activation) { /* by a constant each, so that the loops have no choice in them */
+    case DIST_ACTIVATION_RELU: disti_activate_loop(DIST_ACTIVATION_RELU, scale, n, y, slope); break;
+    case DIST_ACTIVATION_ELU: disti_activate_loop(DIST_ACTIVATION_ELU, scale, n, y, slope); break;
+    case DIST_ACTIVATION_SOFTPLUS: disti_activate_loop(DIST_ACTIVATION_SOFTPLUS, scale, n, y, slope); break;
+    case DIST_ACTIVATION_SINE: disti_activate_loop(DIST_ACTIVATION_SINE, scale, n, y, slope); break;
+    case DIST_ACTIVATION_TANH: disti_activate_loop(DIST_ACTIVATION_TANH, scale, n, y, slope); break;
+    case DIST_ACTIVATION_NONE: disti_activate_loop(DIST_ACTIVATION_NONE, scale, n, y, slope); break;
+    }
+}
+
+/* forward   mu = mean_u x, v = mean_u (x - mu)^2, hat = (x - mu) / sqrt(v + eps), y = gamma hat + beta, for each of the
+   first `lanes` lanes */
+DISTI_INLINE void disti_norm_lanes(int units, size_t lanes, float epsilon, const float *gamma, const float *beta,
+                                   float *DISTI_RESTRICT x, float *DISTI_RESTRICT hat, float *DISTI_RESTRICT inverse)
+{
+    float mean[DISTI_BLOCK], variance[DISTI_BLOCK];
+    size_t count = (size_t)units;
+    for (size_t c = 0; c < lanes; c++) mean[c] = variance[c] = 0.0f;
+    for (size_t u = 0; u < count; u++)
+        for (size_t c = 0; c < lanes; c++) mean[c] += x[u * DISTI_BLOCK + c];
+    for (size_t c = 0; c < lanes; c++) mean[c] /= (float)units;
+    for (size_t u = 0; u < count; u++) {
+        for (size_t c = 0; c < lanes; c++) {
+            float d = x[u * DISTI_BLOCK + c] - mean[c];
+            hat[u * DISTI_BLOCK + c] = d;
+            variance[c] += d * d;
+        }
+    }
+    for (size_t c = 0; c < lanes; c++) inverse[c] = 1.0f / sqrtf(variance[c] / (float)units + epsilon);
+    for (size_t u = 0; u < count; u++) {
+        for (size_t c = 0; c < lanes; c++) {
+            float h = hat[u * DISTI_BLOCK + c] * inverse[c];
+            hat[u * DISTI_BLOCK + c] = h;
+            x[u * DISTI_BLOCK + c] = gamma[u] * h + beta[u];
+        }
+    }
+}
+
+/* d <- P d / sigma,  P d = d - mean_u d - hat mean_u (d hat), for `lanes` lanes; along gets mean_u (d hat). P is
+   symmetric: a tangent goes forward through it as a gradient goes back. */
+DISTI_INLINE void disti_norm_project(int units, size_t lanes, const float *DISTI_RESTRICT hat,
+                                     const float *DISTI_RESTRICT inverse, float *DISTI_RESTRICT d,
+                                     float *DISTI_RESTRICT along)
+{
+    float mean[DISTI_BLOCK], share = 1.0f / (float)units;
+    size_t count = (size_t)units * DISTI_BLOCK;
+    for (size_t c = 0; c < lanes; c++) mean[c] = along[c] = 0.0f;
+    for (size_t u = 0; u < count; u += DISTI_BLOCK) {
+        for (size_t c = 0; c < lanes; c++) {
+            mean[c] += share * d[u + c];
+            along[c] += share * d[u + c] * hat[u + c];
+        }
+    }
+    for (size_t u = 0; u < count; u += DISTI_BLOCK)
+        for (size_t c = 0; c < lanes; c++) d[u + c] = (d[u + c] - mean[c] - hat[u + c] * along[c]) * inverse[c];
+}
+
+/* backward  d_x = P gamma d_y / sigma     in place: d is d_y, then d_x
+   tangents  d_x' = P gamma d_y' / sigma, and from hat' to x, with g' = gamma d_y':
+             d_x -= (hat mean_u (g' hat') + hat' mean_u (g' hat) + d_x' mean_u (hat x')) / sigma */
+DISTI_INLINE void disti_norm_backward(int units, const float *gamma, size_t half, const float *DISTI_RESTRICT hat,
+                                      const float *DISTI_RESTRICT inverse, float *DISTI_RESTRICT d)
+{
+    float along[DISTI_BLOCK], cross[DISTI_BLOCK];
+    size_t count = (size_t)units * DISTI_BLOCK;
+    for (size_t u = 0; u < count; u++) d[u] *= gamma[u / DISTI_BLOCK];
+    if (!half) { /* by a constant, for the loops' sake */
+        disti_norm_project(units, DISTI_BLOCK, hat, inverse, d, along);
+        return;
+    }
+    disti_norm_project(units, half, hat, inverse, d, along);
+    memset(cross, 0, sizeof cross);
+    for (size_t u = half; u < count; u += DISTI_BLOCK)
+        for (size_t c = 0; c < half; c++) cross[c] += d[u + c] * hat[u + c] / (float)units;
+    disti_norm_project(units, half, hat, inverse, d + half, along);
+    for (size_t u = 0; u < count; u += DISTI_BLOCK)
+        for (size_t c = 0; c < half; c++)
+            d[u + c] -= inverse[c] * (hat[u + c] * cross[c] + hat[u + half + c] * along[c] +
+                                            d[u + half + c] * inverse[half + c]);
+}
+
+/* y <- max(0, y) and the bits of the positive lanes of each row */
+static void disti_relu_scalar(size_t rows, float *y, uint64_t *mask)
+{
+    for (size_t u = 0; u < rows; u++) {
+        mask[u] = 0;
+        for (size_t c = 0; c < DISTI_BLOCK; c++) {
+            if (y[u * DISTI_BLOCK + c] > 0.0f) mask[u] |= (uint64_t)1 << c;
+            else y[u * DISTI_BLOCK + c] = 0.0f;
+        }
+    }
+}
+
+/* These of a block from the same text for every instruction set; scalar is the definition, as above. */
+#define DISTI_PLAIN(isa, function)                                                                                     \
+    function void disti_activate_##isa(int activation, float scale, size_t n, float *y, float *slope)                  \
+    {                                                                                                                  \
+        disti_activate(activation, scale, n, y, slope);                                                                \
+    }                                                                                                                  \
+    function void disti_norm_##isa(int units, float epsilon, const float *gamma, const float *beta, float *x,          \
+                                    float *hat, float *inverse)                                                        \
+    {                                                                                                                  \
+        disti_norm_lanes(units, DISTI_BLOCK, epsilon, gamma, beta, x, hat, inverse);                                   \
+    }                                                                                                                  \
+    function void disti_norm_back_##isa(int units, const float *gamma, size_t half, const float *hat,                  \
+                                         const float *inverse, float *d)                                               \
+    {                                                                                                                  \
+        disti_norm_backward(units, gamma, half, hat, inverse, d);                                                      \
+    }
+DISTI_PLAIN(scalar, static)
+
 #if defined(DISTI_X86) || defined(DISTI_NEON)
 
 /* One text serves every instruction set. It is written in these words, which each set defines for itself:
@@ -1540,6 +1812,8 @@ static void disti_outer_scalar(const float *w, const float *s, const int *alive,
 #define DISTI_STEP(R, V, FACTORS, w, x) \
     { const float *const ws = w, *const xs = x; DISTI_X##V(DISTI_INPUT, 0) DISTI_Y##R(FACTORS, V) DISTI_FENCE }
 
+/* Not where a sum is two operations: -ffast-math would reorder the terms of several steps, and dead rows would show. */
+#define DISTI_UNROLLED (DISTI_LANES > 4)
 /* Keeps gcc from mixing the loads of unrolled steps until it runs out of registers. */
 #if defined(__GNUC__) && !defined(__clang__)
 #define DISTI_FENCE __asm__ volatile("" : : : "memory");
@@ -1587,7 +1861,7 @@ static void disti_outer_scalar(const float *w, const float *s, const int *alive,
             const float *end = w + (size_t)(unsigned)to * 8;                                                           \
             w += (size_t)(unsigned)from * 8;                                                                           \
             x += (size_t)(unsigned)from * DISTI_BLOCK;                                                                 \
-            for (; end - w >= 4 * 8; w += 4 * 8, x += 4 * DISTI_BLOCK) {                                               \
+            for (; DISTI_UNROLLED && end - w >= 4 * 8; w += 4 * 8, x += 4 * DISTI_BLOCK) {                             \
                 DISTI_AHEAD(w, ahead);                                                                                 \
                 DISTI_AHEAD(w + 16, ahead);                                                                            \
                 DISTI_STEP(R, V, DISTI_SIDE, w, x)                                                                     \
@@ -1643,7 +1917,7 @@ static void disti_outer_scalar(const float *w, const float *s, const int *alive,
             const size_t end = (size_t)(unsigned)to;                                                                   \
             const float *w = weights + (o >> 3) * panel, *x = d_y + o * DISTI_BLOCK;                                   \
             next += (o >> 3) * panel;                                                                                  \
-            for (; o + 8 <= end; o += 8, w += panel - 8, next += panel) {                                              \
+            for (; DISTI_UNROLLED && o + 8 <= end; o += 8, w += panel - 8, next += panel) {                            \
                 DISTI_AHEAD(next, 0);                                                                                  \
                 DISTI_AHEAD(next, 16);                                                                                 \
                 DISTI_AHEAD(next, 32);                                                                                 \
@@ -1693,6 +1967,18 @@ static void disti_outer_scalar(const float *w, const float *s, const int *alive,
         DISTI_Y##R(DISTI_ACCUMULATE, V)                                                                                \
     }
 
+#define DISTI_RELU_ROWS(isa)                                                                                           \
+    DISTI_FUNCTION void disti_relu_##isa(size_t rows, float *y, uint64_t *mask)                                        \
+    {                                                                                                                  \
+        for (size_t u = 0; u < rows; u++, y += DISTI_BLOCK, mask++) {                                                  \
+            *mask = 0;                                                                                                 \
+            for (int c = 0; c < DISTI_BLOCK; c += DISTI_LANES) {                                                       \
+                const DISTI_VEC v = DISTI_LOAD(y + c);                                                                 \
+                DISTI_BITS(mask, c, v)                                                                                 \
+                DISTI_STORE(y + c, DISTI_RELU(v));                                                                     \
+            }                                                                                                          \
+        }                                                                                                              \
+    }
 #define DISTI_OUTER1(i, j)                                                                                             \
     DISTI_STORE(to + j * DISTI_LANES, DISTI_KEEP(DISTI_FMA(b, x##j, zero), bits >> (j * DISTI_LANES)));
 #define DISTI_LAST_LAYER(isa)                                                                                          \
@@ -1799,6 +2085,8 @@ static void disti_outer_scalar(const float *w, const float *s, const int *alive,
     DISTI_WEIGHTS_TILE(middle_##isa, 8, 2)                                                                             \
     DISTI_WEIGHTS_TILE(narrow_##isa, 8, 1)                                                                             \
     DISTI_LAST_LAYER(isa)                                                                                              \
+    DISTI_RELU_ROWS(isa)                                                                                               \
+    DISTI_PLAIN(isa, DISTI_LOOPS DISTI_FUNCTION)                                                                       \
     DISTI_DRIVERS(isa, R, W)
 
 /* The eight rows of d_x that begin at the list's entry n; beyond its end the last one again. */
@@ -1947,7 +2235,11 @@ DISTI_KERNELS(neon, 8, 3)
     kernels.gemm_back = disti_gemm_back_##isa; \
     kernels.gemm_weights = disti_gemm_weights_##isa; \
     kernels.dot = disti_dot_##isa; \
-    kernels.outer = disti_outer_##isa;
+    kernels.outer = disti_outer_##isa; \
+    kernels.relu = disti_relu_##isa; \
+    kernels.activate = disti_activate_##isa; \
+    kernels.norm = disti_norm_##isa; \
+    kernels.norm_back = disti_norm_back_##isa;
 
 /* isa: one that disti_cpu_has */
 static disti_kernels disti_kernels_for(int isa)
@@ -1985,6 +2277,7 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_APART
 #undef DISTI_STEP
 #undef DISTI_FENCE
+#undef DISTI_UNROLLED
 #undef DISTI_AHEAD
 #undef DISTI_VECTORS
 #undef DISTI_STORE_RELU1
@@ -2007,6 +2300,8 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_FETCH
 #undef DISTI_WEIGHTS_TILE
 #undef DISTI_OUTER1
+#undef DISTI_RELU_ROWS
+#undef DISTI_PLAIN
 #undef DISTI_LAST_LAYER
 #undef DISTI_EACH
 #undef DISTI_DRIVERS
@@ -2027,132 +2322,6 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_DEPTH
 #undef DISTI_MAC_LANE
 #undef DISTI_TABLE
-
-/* exp to 2 ulp; below -87 it is 0, above 88 the largest float. */
-static float disti_exp(float x)
-{
-    x = x < 88.0f ? x : 88.0f; /* also for NaN, which may stand in idle lanes */
-    x = x > -87.0f ? x : -87.0f;
-    float n = x * 1.44269504f;
-    int32_t k = (int32_t)(n < 0.0f ? n - 0.5f : n + 0.5f);
-    n = (float)k;
-    float r = x - n * 0.693359375f;
-    r += n * 2.12194440e-4f;
-    float p = 1.9875691500e-4f;
-    p = p * r + 1.3981999507e-3f;
-    p = p * r + 8.3334519073e-3f;
-    p = p * r + 4.1665795894e-2f;
-    p = p * r + 1.6666665459e-1f;
-    p = p * r + 5.0000001201e-1f;
-    p = p * r * r + r + 1.0f;
-    uint32_t bits = (uint32_t)(k + 127) << 23;
-    float scale;
-    memcpy(&scale, &bits, sizeof scale);
-    return p * scale;
-}
-
-static float disti_tanh(float x)
-{
-    float a = x < 0.0f ? -x : x;
-    float s = x * x;
-    float small = x + x * s * ((((-5.70498872745e-3f * s + 2.06390887954e-2f) * s - 5.37397155531e-2f) * s +
-                                1.33314422036e-1f) * s - 3.33332819422e-1f);
-    float large = 1.0f - 2.0f / (disti_exp(2.0f * (a > 20.0f ? 20.0f : a)) + 1.0f);
-    return a < 0.625f ? small : (x < 0.0f ? -large : large);
-}
-
-static float disti_sigmoid(float x)
-{
-    float e = disti_exp(x < 0.0f ? x : -x);
-    return x < 0.0f ? e / (1.0f + e) : 1.0f / (1.0f + e);
-}
-
-/* Their derivatives, by e = exp(-2 |x|) and exp(-|x|): relatively exact where 1 - tanh^2 would have cancelled to
-   nothing. */
-static float disti_tanh_slope(float x)
-{
-    float e = disti_exp(x < 0.0f ? 2.0f * x : -2.0f * x);
-    return 4.0f * e / ((1.0f + e) * (1.0f + e));
-}
-
-static float disti_sigmoid_slope(float x)
-{
-    float e = disti_exp(x < 0.0f ? x : -x);
-    return e / ((1.0f + e) * (1.0f + e));
-}
-
-/* log(1 + exp(-a)), a >= 0: the smooth part of softplus, by 2 atanh(u / (2 + u)). */
-static float disti_log1p_exp(float a)
-{
-    float u = disti_exp(-a);
-    float s = u / (2.0f + u);
-    float q = s * s;
-    return 2.0f * s *
-           (1.0f +
-            q * (1.0f / 3 + q * (1.0f / 5 + q * (1.0f / 7 + q * (1.0f / 9 + q * (1.0f / 11 + q * (1.0f / 13)))))));
-}
-
-/* Sine and cosine of a double, range-reduced by multiples of pi / 2 in two parts: full float accuracy up to 1e9, and
-   values in [-1, 1] for anything finite. */
-static void disti_sincos(double x, double *sine, double *cosine)
-{
-    if (!(x > -1e15 && x < 1e15)) x = 0.0;
-    double q = x * 0.63661977236758134308;
-    int64_t k = (int64_t)(q < 0 ? q - 0.5 : q + 0.5);
-    double r = (x - (double)k * 1.57079632673412561417) - (double)k * 6.07710050650619224932e-11;
-    double s = r * r;
-    double sn = r + r * s *
-                        (-1.66666666666666324348e-1 +
-                         s * (8.33333333332248946124e-3 +
-                              s * (-1.98412698298579493134e-4 +
-                                   s * (2.75573137070700676789e-6 + s * -2.50507602534068634195e-8))));
-    double cs = 1.0 - s * (0.5 - s * (4.16666666666666019037e-2 - s * (1.38888888888741095749e-3 -
-                s * (2.48015872894767294178e-5 - s * 2.75573143513906633035e-7))));
-    int odd = (int)(k & 1);
-    double a = odd ? cs : sn, b = odd ? sn : cs;
-    *sine = (k & 2) ? -a : a;
-    *cosine = ((k + 1) & 2) ? -b : b;
-}
-
-/* y <- activation(y), n values; slope (n) gets its derivative unless NULL. scale: softplus's beta, sine's omega. */
-static void disti_activate(int activation, float scale, size_t n, float *y, float *slope)
-{
-    for (size_t i = 0; i < n; i++) {
-        float x = y[i], v = x, d = 1.0f;
-        switch (activation) {
-        case DIST_ACTIVATION_RELU:
-            d = x > 0.0f ? 1.0f : 0.0f;
-            v = x > 0.0f ? x : 0.0f;
-            break;
-        case DIST_ACTIVATION_ELU: {
-            float near_zero = x * (1.0f + x * (0.5f + x * (1.0f / 6 + x * (1.0f / 24 + x * (1.0f / 120)))));
-            v = x > 0.0f ? x : (x > -0.1f ? near_zero : disti_exp(x) - 1.0f);
-            d = x > 0.0f ? 1.0f : v + 1.0f;
-            break;
-        }
-        case DIST_ACTIVATION_SOFTPLUS: {
-            float a = scale * x;
-            v = (x > 0.0f ? x : 0.0f) + disti_log1p_exp(a < 0.0f ? -a : a) / scale;
-            d = disti_sigmoid(a);
-            break;
-        }
-        case DIST_ACTIVATION_SINE: {
-            double s, c;
-            disti_sincos((double)scale * (double)x, &s, &c);
-            v = (float)s;
-            d = (float)((double)scale * c);
-            break;
-        }
-        case DIST_ACTIVATION_TANH:
-            v = disti_tanh(x);
-            d = disti_tanh_slope(x);
-            break;
-        case DIST_ACTIVATION_NONE: break;
-        }
-        y[i] = v;
-        if (slope) slope[i] = d;
-    }
-}
 
 /*@ 04 field -------------------------------------------------------------------------------------------------------- */
 
@@ -4517,12 +4686,11 @@ static int disti_encoding_row(const dist_net *net, int level, int axis, int cosi
 static void disti_encode(const dist_net *net, size_t n, const float *points, float *rows)
 {
     for (size_t c = 0; c < DISTI_BLOCK; c++) {
-        const float *p = points +
-                         3 * (c < n ? c : n - 1); /* idle lanes repeat the last point: no unit lives for them alone */
-        for (int axis = 0; axis < 3; axis++) {
+        /* idle lanes repeat the last point: no unit lives for them alone */
+        const float *p = points + 3 * (c < n ? c : n - 1);
+        for (size_t axis = 0; axis < 3 && net->raw; axis++) rows[axis * DISTI_BLOCK + c] = p[axis];
+        for (int axis = 0; axis < 3 && net->levels > 0; axis++) {
             double s, co;
-            if (net->raw) rows[(size_t)axis * DISTI_BLOCK + c] = p[axis];
-            if (net->levels == 0) continue;
             disti_sincos(net->base * (double)p[axis], &s, &co);
             for (int k = 0; k < net->levels; k++) {
                 rows[(size_t)disti_encoding_row(net, k, axis, 0) * DISTI_BLOCK + c] = (float)s;
@@ -4557,88 +4725,17 @@ static void disti_encode_backward(const dist_net *net, const disti_block *b, flo
     }
 }
 
-/* d <- P d / sigma,  P d = d - mean_u d - hat mean_u (d hat), for `lanes` lanes; along gets mean_u (d hat). P is
-   symmetric: a tangent goes forward through it as a gradient goes back. */
-static void disti_norm_project(int units, size_t lanes, const float *DISTI_RESTRICT hat,
-                               const float *DISTI_RESTRICT inverse, float *DISTI_RESTRICT d,
-                               float *DISTI_RESTRICT along)
+/* disti_norm_lanes of the values in the first `half` lanes, then their tangents in the others:
+   hat' = P x' / sqrt(v + eps),  y' = gamma hat'; the inverse's place gets mean_u (hat x') */
+static void disti_norm_tangents(int units, float epsilon, const float *gamma, const float *beta, size_t half,
+                                float *DISTI_RESTRICT x, float *DISTI_RESTRICT hat, float *DISTI_RESTRICT inverse)
 {
-    float mean[DISTI_BLOCK], share = 1.0f / (float)units;
-    size_t count = (size_t)units * DISTI_BLOCK;
-    for (size_t c = 0; c < lanes; c++) mean[c] = along[c] = 0.0f;
-    for (size_t u = 0; u < count; u += DISTI_BLOCK) {
-        for (size_t c = 0; c < lanes; c++) {
-            mean[c] += share * d[u + c];
-            along[c] += share * d[u + c] * hat[u + c];
-        }
-    }
-    for (size_t u = 0; u < count; u += DISTI_BLOCK)
-        for (size_t c = 0; c < lanes; c++) d[u + c] = (d[u + c] - mean[c] - hat[u + c] * along[c]) * inverse[c];
-}
-
-/* forward   mu = mean_u x, v = mean_u (x - mu)^2, sigma = sqrt(v + eps), hat = (x - mu) / sigma, y = gamma hat + beta,
-             for each lane; inverse gets 1 / sigma
-   tangents  hat' = P x' / sigma,  y' = gamma hat'; the inverse's place gets mean_u (hat x') */
-static void disti_norm(int units, float epsilon, const float *gamma, const float *beta, size_t half,
-                       float *DISTI_RESTRICT x, float *DISTI_RESTRICT hat, float *DISTI_RESTRICT inverse)
-{
-    float mean[DISTI_BLOCK], variance[DISTI_BLOCK];
-    size_t count = (size_t)units, lanes = half ? half : (size_t)DISTI_BLOCK;
-    for (size_t c = 0; c < lanes; c++) mean[c] = variance[c] = 0.0f;
-    for (size_t u = 0; u < count; u++)
-        for (size_t c = 0; c < lanes; c++) mean[c] += x[u * DISTI_BLOCK + c];
-    for (size_t c = 0; c < lanes; c++) mean[c] /= (float)units;
-    for (size_t u = 0; u < count; u++) {
-        for (size_t c = 0; c < lanes; c++) {
-            float d = x[u * DISTI_BLOCK + c] - mean[c];
-            hat[u * DISTI_BLOCK + c] = d;
-            variance[c] += d * d;
-        }
-    }
-    for (size_t c = 0; c < lanes; c++) inverse[c] = 1.0f / sqrtf(variance[c] / (float)units + epsilon);
-    for (size_t u = 0; u < count; u++) {
-        for (size_t c = 0; c < lanes; c++) {
-            float h = hat[u * DISTI_BLOCK + c] * inverse[c];
-            hat[u * DISTI_BLOCK + c] = h;
-            x[u * DISTI_BLOCK + c] = gamma[u] * h + beta[u];
-        }
-    }
-    if (!half) return;
+    size_t count = (size_t)units;
+    disti_norm_lanes(units, half, epsilon, gamma, beta, x, hat, inverse);
     disti_norm_project(units, half, hat, inverse, x + half, inverse + half);
     for (size_t u = 0; u < count; u++) {
         memcpy(hat + u * DISTI_BLOCK + half, x + u * DISTI_BLOCK + half, half * sizeof(float));
         for (size_t c = half; c < 2 * half; c++) x[u * DISTI_BLOCK + c] *= gamma[u];
-    }
-}
-
-/* backward  d_x = P gamma d_y / sigma     in place: d is d_y, then d_x
-   tangents  d_x' = P gamma d_y' / sigma, and from hat' to x, with g' = gamma d_y':
-             d_x -= (hat mean_u (g' hat') + hat' mean_u (g' hat) + d_x' mean_u (hat x')) / sigma */
-static void disti_norm_backward(int units, const float *gamma, size_t half, const float *DISTI_RESTRICT hat,
-                                const float *DISTI_RESTRICT inverse, float *DISTI_RESTRICT d)
-{
-    float along[DISTI_BLOCK], cross[DISTI_BLOCK];
-    size_t count = (size_t)units * DISTI_BLOCK;
-    for (size_t u = 0; u < count; u++) d[u] *= gamma[u / DISTI_BLOCK];
-    disti_norm_project(units, half ? half : (size_t)DISTI_BLOCK, hat, inverse, d, along);
-    if (!half) return;
-    memset(cross, 0, sizeof cross);
-    for (size_t u = half; u < count; u += DISTI_BLOCK)
-        for (size_t c = 0; c < half; c++) cross[c] += d[u + c] * hat[u + c] / (float)units;
-    disti_norm_project(units, half, hat, inverse, d + half, along);
-    for (size_t u = 0; u < count; u += DISTI_BLOCK)
-        for (size_t c = 0; c < half; c++)
-            d[u + c] -= inverse[c] * (hat[u + c] * cross[c] + hat[u + half + c] * along[c] +
-                                      d[u + half + c] * inverse[half + c]);
-}
-
-/* Bits of the positive lanes of each row. */
-static void disti_positive(size_t rows, const float *y, uint64_t *mask)
-{
-    for (size_t u = 0; u < rows; u++) {
-        uint64_t bits = 0;
-        for (size_t c = 0; c < DISTI_BLOCK; c++) bits |= (uint64_t)(y[u * DISTI_BLOCK + c] > 0.0f) << c;
-        mask[u] = bits;
     }
 }
 
@@ -4727,8 +4824,8 @@ static void disti_hidden_tangents(const dist_shape *shape, const disti_block *b,
     for (size_t u = 0; u < out; u++)
         for (size_t c = 0; c < half; c++) y[u * DISTI_BLOCK + c] += bias[u];
     if (net->normed)
-        disti_norm(layer->out, net->norm_epsilon, net->params + layer->norm_weight, net->params + layer->norm_bias,
-                   half, y, b->hat + (size_t)l * width * DISTI_BLOCK, b->inverse + (size_t)l * DISTI_BLOCK);
+        disti_norm_tangents(layer->out, net->norm_epsilon, net->params + layer->norm_weight,
+                            net->params + layer->norm_bias, half, y, b->hat + (size_t)l * width * DISTI_BLOCK, b->inverse + (size_t)l * DISTI_BLOCK);
     for (size_t u = 0; u < out; u++) {
         float *v = y + u * DISTI_BLOCK, *slope = b->slope ? b->slope + ((size_t)l * width + u) * DISTI_BLOCK : own;
         disti_activate(net->activation, scale, half, v, slope);
@@ -4754,8 +4851,7 @@ static void disti_hidden(const dist_shape *shape, const disti_kernels *kernels, 
     int plain = net->activation == DIST_ACTIVATION_RELU && !net->normed && !b->half;
     if (disti_use_blas(shape, l)) {
         disti_linear_blas(shape, l, bias, x, y);
-        if (plain) disti_activate(DIST_ACTIVATION_RELU, 1.0f, out * DISTI_BLOCK, y, NULL);
-        if (plain) disti_positive(out, y, mask);
+        if (plain) kernels->relu(out, y, mask);
     } else {
         disti_gemm g;
         g.weights = net->panels + layer->panel;
@@ -4772,14 +4868,15 @@ static void disti_hidden(const dist_shape *shape, const disti_kernels *kernels, 
         kernels->gemm(&g);
     }
     if (net->normed && !b->half)
-        disti_norm(layer->out, net->norm_epsilon, net->params + layer->norm_weight, net->params + layer->norm_bias, 0,
-                   y, b->hat + (size_t)l * width * DISTI_BLOCK, b->inverse + (size_t)l * DISTI_BLOCK);
+        kernels->norm(layer->out, net->norm_epsilon, net->params + layer->norm_weight, net->params + layer->norm_bias,
+                      y, b->hat + (size_t)l * width * DISTI_BLOCK, b->inverse + (size_t)l * DISTI_BLOCK);
     if (b->half) {
         disti_hidden_tangents(shape, b, l, y);
+    } else if (net->activation != DIST_ACTIVATION_RELU) {
+        float *slope = b->values ? NULL : b->slope + (size_t)l * width * DISTI_BLOCK;
+        kernels->activate(net->activation, l == 0 ? net->first_scale : net->scale, out * DISTI_BLOCK, y, slope);
     } else if (!plain) {
-        float *slope = b->slope ? b->slope + (size_t)l * width * DISTI_BLOCK : NULL;
-        disti_activate(net->activation, l == 0 ? net->first_scale : net->scale, out * DISTI_BLOCK, y, slope);
-        if (net->activation == DIST_ACTIVATION_RELU) disti_positive(out, y, mask);
+        kernels->relu(out, y, mask);
     }
     const disti_linear *next = &net->layer[l + 1];
     if (next->point > 0) memcpy(y + out * DISTI_BLOCK, b->point, (size_t)next->point * DISTI_BLOCK * sizeof(float));
@@ -4824,32 +4921,39 @@ static void disti_net_output(const dist_shape *shape, const disti_block *b, cons
     float bias = shape->bias[(size_t)l * (size_t)net->max_rows + (size_t)channel];
     kernels.dot(net->panels + layer->panel + (size_t)channel * (size_t)rows, b->half ? 0.0f : bias, x, alive,
                 b->alive_count[l], rows, b->columns, value);
-    for (size_t c = 0; c < (size_t)(b->half ? b->half : DISTI_BLOCK); c++) {
-        float v = b->half ? value[c] + bias : value[c], d = 1.0f, bend = 0.0f;
-        int twice = net->output == DISTI_OUTPUT_TANH_TWICE;
-        slope[c] = 0.0f;
-        if (curvature) curvature[c] = 0.0f;
-        if (!disti_finite(v)) continue; /* value stays what it is: the ray is told */
-        for (int k = 0; k < twice + (twice || net->output == DISTI_OUTPUT_TANH); k++) {
-            float t = disti_tanh(v), s = b->values ? 0.0f : disti_tanh_slope(v);
-            bend = s * (bend - 2.0f * t * d * d); /* of t(v): t'' v'^2 + t' v'' */
-            d *= s;
-            v = t;
+    float v[DISTI_BLOCK], d[DISTI_BLOCK], t[DISTI_BLOCK], bend[DISTI_BLOCK];
+    float level = channel == net->sdf_channel ? net->level : 0.0f;
+    int twice = net->output == DISTI_OUTPUT_TANH_TWICE;
+    for (size_t c = 0; c < DISTI_BLOCK; c++) {
+        v[c] = b->half ? value[c] + bias : value[c];
+        d[c] = 1.0f;
+        bend[c] = 0.0f;
+    }
+    for (int k = 0; k < twice + (twice || net->output == DISTI_OUTPUT_TANH); k++) {
+        kernels.activate(DIST_ACTIVATION_TANH, 1.0f, DISTI_BLOCK, v, b->values ? NULL : t);
+        for (size_t c = 0; c < DISTI_BLOCK && !b->values; c++) {
+            bend[c] = t[c] * (bend[c] - 2.0f * v[c] * d[c] * d[c]); /* of t(v): t'' v'^2 + t' v'' */
+            d[c] *= t[c];
         }
+    }
+    for (size_t c = 0; c < (b->half ? (size_t)b->half : (size_t)DISTI_BLOCK); c++) {
+        int finite = disti_finite(value[c]); /* else value stays what it is: the ray is told */
         if (net->output == DISTI_OUTPUT_SIGMOID) {
-            d = disti_sigmoid_slope(v);
-            v = disti_sigmoid(v);
-            bend = d * (1.0f - 2.0f * v);
+            d[c] = disti_sigmoid_slope(v[c]);
+            v[c] = disti_sigmoid(v[c]);
+            bend[c] = d[c] * (1.0f - 2.0f * v[c]);
         }
-        value[c] = channel == net->sdf_channel ? v - net->level : v;
-        slope[c] = d;
-        if (curvature) curvature[c] = bend;
+        if (finite) value[c] = v[c] - level;
+        if (b->values) continue;
+        slope[c] = finite ? d[c] : 0.0f;
+        if (curvature) curvature[c] = finite ? bend[c] : 0.0f;
     }
 }
 
 /* delta of layer l's output (after the activation) to that of its pre-activation, in place. ReLU's mask is in it
    already. sums, unless NULL, gets what gamma and beta receive: sum_c delta hat, sum_c delta. */
-static void disti_hidden_delta(const dist_net *net, const disti_block *b, int l, float *delta, float *sums)
+static void disti_hidden_delta(const dist_net *net, const disti_kernels *kernels, const disti_block *b, int l,
+                               float *delta, float *sums)
 {
     const disti_linear *layer = &net->layer[l];
     size_t width = (size_t)net->max_rows, out = (size_t)layer->out;
@@ -4879,8 +4983,8 @@ static void disti_hidden_delta(const dist_net *net, const disti_block *b, int l,
                     sums[disti_store_out(layer) + u] += delta[u * DISTI_BLOCK + c];
             }
         }
-        disti_norm_backward(layer->out, net->params + layer->norm_weight, (size_t)b->half,
-                            b->hat + (size_t)l * width * DISTI_BLOCK, b->inverse + (size_t)l * DISTI_BLOCK, delta);
+        kernels->norm_back(layer->out, net->params + layer->norm_weight, (size_t)b->half,
+                           b->hat + (size_t)l * width * DISTI_BLOCK, b->inverse + (size_t)l * DISTI_BLOCK, delta);
     }
 }
 
@@ -4989,7 +5093,8 @@ static void disti_net_reverse(const dist_shape *shape, disti_block *b, const flo
     if (layer->code) memcpy(b->fold_delta + (size_t)--fold * width * DISTI_BLOCK, seed, seeds);
     for (int l = last - 1; l >= 0; l--) {
         layer = &net->layer[l];
-        disti_hidden_delta(net, b, l, delta, store ? store + disti_store_offset(net, l, DISTI_STORE_NORM) : NULL);
+        disti_hidden_delta(net, &kernels, b, l, delta,
+                           store ? store + disti_store_offset(net, l, DISTI_STORE_NORM) : NULL);
         if (layer->code) disti_keep_delta(net, b, l, delta, b->fold_delta + (size_t)--fold * width * DISTI_BLOCK);
         if (store) disti_keep_delta(net, b, l, delta, store + disti_store_offset(net, l, DISTI_STORE_DELTA));
         float *d_x = b->delta[l & 1];
@@ -5159,7 +5264,8 @@ static size_t disti_wide_floats(const dist_context *ctx, const dist_net *net)
 }
 
 /* Hidden layer l by the BLAS: y = activation(W x + W_point point + bias), rows of DISTI_WIDE_COLUMNS. */
-static void disti_wide_hidden(const dist_shape *shape, int l, int columns, const float *x, const float *point, float *y)
+static void disti_wide_hidden(const dist_shape *shape, const disti_kernels *kernels, int l, int columns, const float *x,
+                              const float *point, float *y)
 {
     const dist_net *net = shape->net;
     const disti_linear *layer = &net->layer[l];
@@ -5178,7 +5284,7 @@ static void disti_wide_hidden(const dist_shape *shape, int l, int columns, const
             for (int c = 0; net->activation == DIST_ACTIVATION_RELU && c < DISTI_BLOCK; c++)
                 row[c] = row[c] > 0.0f ? row[c] : 0.0f;
             if (net->activation != DIST_ACTIVATION_RELU)
-                disti_activate(net->activation, net->scale, DISTI_BLOCK, row, NULL);
+                kernels->activate(net->activation, net->scale, DISTI_BLOCK, row, NULL);
         }
     }
 }
@@ -5212,7 +5318,7 @@ static void disti_wide_eval(const dist_shape *shape, int worker, size_t n, const
             disti_copy_rows((size_t)net->point_size, b.point, DISTI_BLOCK, point + j * DISTI_BLOCK, stride);
         }
         for (int l = 1; l + 1 < net->layers; l++)
-            disti_wide_hidden(shape, l, (int)(blocks * DISTI_BLOCK), wide[(l - 1) & 1], point, wide[l & 1]);
+            disti_wide_hidden(shape, &kernels, l, (int)(blocks * DISTI_BLOCK), wide[(l - 1) & 1], point, wide[l & 1]);
         for (size_t j = 0; j < blocks; j++) {
             size_t first = at + j * DISTI_BLOCK;
             b.alive_count[net->layers - 1] = last->prev + last->point;

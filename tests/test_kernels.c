@@ -302,6 +302,62 @@ static void check_outer_case(const disti_kernels *kernels, test_random *random, 
     release(before, n);
 }
 
+/* ReLU with its bits, every activation with its slope, LayerNorm and its adjoint, against the scalar kernels; where these
+   cannot be told from the formulas, see test_net and test_gradients. Numbers that are not finite do not spread. */
+static void check_plain_case(const disti_kernels *kernels, test_random *random, test_size size)
+{
+    const disti_kernels scalar = disti_kernels_for(DIST_ISA_SCALAR);
+    const size_t n = (size_t)size.rows * TEST_BLOCK, rows = (size_t)size.rows;
+    float *x = floats(n), *a = floats(n), *b = floats(n), *slope_a = floats(n), *slope_b = floats(n), *gamma = floats(rows);
+    float *beta = floats(rows), inverse[2][TEST_BLOCK];
+    uint64_t mask[2][TEST_LONGEST];
+    test_random_fill(random, n, x, -4.0f, 4.0f);
+    test_random_fill(random, rows, gamma, -1.0f, 1.0f);
+    test_random_fill(random, rows, beta, -1.0f, 1.0f);
+    memcpy(a, x, n * sizeof *x);
+    memcpy(b, x, n * sizeof *x);
+#ifndef __FAST_MATH__
+    a[n / 2] = b[n / 2] = test_nan();
+#endif
+    scalar.relu(rows, a, mask[0]);
+    kernels->relu(rows, b, mask[1]);
+    CHECK_BYTES(n * sizeof *x, a, b);
+    CHECK_BYTES(rows * sizeof **mask, mask[0], mask[1]);
+    for (int activation = DIST_ACTIVATION_RELU; activation <= DIST_ACTIVATION_NONE; activation++) {
+        const float scale = activation == DIST_ACTIVATION_SINE ? 30.0f : 2.0f;
+        for (int slopes = 0; slopes < 2; slopes++) {
+            memcpy(a, x, n * sizeof *x);
+            memcpy(b, x, n * sizeof *x);
+            a[0] = b[0] = 200.0f; /* where exp overflows */
+            a[1] = b[1] = -200.0f;
+            scalar.activate(activation, scale, n, a, slopes ? slope_a : NULL);
+            kernels->activate(activation, scale, n, b, slopes ? slope_b : NULL);
+            CHECK_NEAR_ARRAY(n, a, b, 2e-6);
+            if (slopes) CHECK_NEAR_ARRAY(n, slope_a, slope_b, 2e-6 * (double)scale);
+        }
+    }
+    memcpy(a, x, n * sizeof *x);
+    memcpy(b, x, n * sizeof *x);
+    scalar.norm(size.rows, 1e-2f, gamma, beta, a, slope_a, inverse[0]);
+    kernels->norm(size.rows, 1e-2f, gamma, beta, b, slope_b, inverse[1]);
+    CHECK_NEAR_ARRAY(n, a, b, 2e-5);
+    CHECK_NEAR_ARRAY(n, slope_a, slope_b, 2e-5);
+    for (size_t half = 0; half <= TEST_BLOCK / 2; half += TEST_BLOCK / 2) {
+        test_random_fill(random, n, a, -1.0f, 1.0f);
+        memcpy(b, a, n * sizeof *a);
+        scalar.norm_back(size.rows, gamma, half, slope_a, inverse[0], a);
+        kernels->norm_back(size.rows, gamma, half, slope_a, inverse[0], b);
+        CHECK_NEAR_ARRAY(n, a, b, 1e-3); /* one row: divided by sigma = 0.1 twice and more */
+    }
+    release(x, n);
+    release(a, n);
+    release(b, n);
+    release(slope_a, n);
+    release(slope_b, n);
+    release(gamma, rows);
+    release(beta, rows);
+}
+
 typedef struct test_result {
     float y[72 * TEST_BLOCK];
     float dot[TEST_BLOCK];
@@ -366,7 +422,7 @@ static void check_same_bits(const disti_kernels *kernels, test_random *random, t
     release(y, (size_t)padded * TEST_BLOCK);
 }
 
-enum { GEMM, BACK, WEIGHTS, DOT, OUTER, ZERO_ROWS, FEWER_COLUMNS };
+enum { GEMM, BACK, WEIGHTS, DOT, OUTER, PLAIN, ZERO_ROWS, FEWER_COLUMNS };
 
 static void check_all_sizes(int isa, int what)
 {
@@ -382,6 +438,7 @@ static void check_all_sizes(int isa, int what)
             if (what == WEIGHTS && variant < 2) check_weights_case(&kernels, &random, size, variant * (n % 7));
             if (what == DOT && variant < 2) check_dot_case(&kernels, &random, size, variant);
             if (what == OUTER) check_outer_case(&kernels, &random, size, variant & 1, variant >> 1);
+            if (what == PLAIN && variant == 0 && n % 7 == 0) check_plain_case(&kernels, &random, size);
             if (size.out > 70) continue;
             if (what == ZERO_ROWS && variant < 2) check_same_bits(&kernels, &random, size, 1, variant);
             if (what == FEWER_COLUMNS && variant < 2) check_same_bits(&kernels, &random, size, 0, variant);
@@ -398,6 +455,7 @@ static void check_all_sizes(int isa, int what)
     TEST(gemm_weights_of_##name##_is_its_formula_and_leaves_gaps_alone) { check_all_sizes(isa, WEIGHTS); }  \
     TEST(dot_of_##name##_is_its_formula) { check_all_sizes(isa, DOT); }                                     \
     TEST(outer_of_##name##_is_its_formula_and_writes_listed_rows_only) { check_all_sizes(isa, OUTER); }     \
+    TEST(element_by_element_##name##_does_what_scalar_does) { check_all_sizes(isa, PLAIN); }                \
     TEST(leaving_out_zero_rows_changes_no_bit_with_##name) { check_all_sizes(isa, ZERO_ROWS); }             \
     TEST(a_column_does_not_depend_on_their_number_with_##name) { check_all_sizes(isa, FEWER_COLUMNS); }
 
@@ -407,6 +465,7 @@ static void check_all_sizes(int isa, int what)
     RUN(gemm_weights_of_##name##_is_its_formula_and_leaves_gaps_alone); \
     RUN(dot_of_##name##_is_its_formula);                             \
     RUN(outer_of_##name##_is_its_formula_and_writes_listed_rows_only); \
+    RUN(element_by_element_##name##_does_what_scalar_does);          \
     RUN(leaving_out_zero_rows_changes_no_bit_with_##name);           \
     RUN(a_column_does_not_depend_on_their_number_with_##name)
 

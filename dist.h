@@ -1586,8 +1586,8 @@ DISTI_INLINE float disti_log1p_exp(float a)
             q * (1.0f / 3 + q * (1.0f / 5 + q * (1.0f / 7 + q * (1.0f / 9 + q * (1.0f / 11 + q * (1.0f / 13)))))));
 }
 
-/* Sine and cosine of a double, range-reduced by multiples of pi / 2 in two parts: full float accuracy up to 1e9, 0 beyond, and
-   values in [-1, 1] for anything finite. */
+/* Sine and cosine of a double, range-reduced by multiples of pi / 2 in two parts: full float accuracy up to 1e9, of 0
+   beyond, and values in [-1, 1] for anything finite. */
 DISTI_INLINE void disti_sincos(double x, double *sine, double *cosine)
 {
     x = x > -1e9 ? x : 0.0;
@@ -2180,7 +2180,8 @@ DISTI_KERNELS(avx2, 4, 3)
 /* Unmasked, gcc 12 warns in C++ that its own header uses an uninitialized variable. */
 #define DISTI_RELU(v) _mm512_maskz_max_ps((__mmask16)0xffff, v, _mm512_setzero_ps())
 #define DISTI_POSITIVE(v) _mm512_cmp_ps_mask(v, _mm512_setzero_ps(), _CMP_GT_OQ)
-#define DISTI_BITS(row, column, v) { const __mmask16 m = DISTI_POSITIVE(v); memcpy((char *)(row) + (column) / 8, &m, 2); }
+#define DISTI_BITS(row, column, v) \
+    { const __mmask16 m = DISTI_POSITIVE(v); memcpy((char *)(row) + (column) / 8, &m, sizeof m); }
 #define DISTI_KEEP(v, bits) _mm512_maskz_mov_ps((__mmask16)((bits) & 0xffff), v)
 #define DISTI_DEPTH 512
 DISTI_KERNELS(avx512, 8, 3)
@@ -4825,7 +4826,8 @@ static void disti_hidden_tangents(const dist_shape *shape, const disti_block *b,
         for (size_t c = 0; c < half; c++) y[u * DISTI_BLOCK + c] += bias[u];
     if (net->normed)
         disti_norm_tangents(layer->out, net->norm_epsilon, net->params + layer->norm_weight,
-                            net->params + layer->norm_bias, half, y, b->hat + (size_t)l * width * DISTI_BLOCK, b->inverse + (size_t)l * DISTI_BLOCK);
+                            net->params + layer->norm_bias, half, y, b->hat + (size_t)l * width * DISTI_BLOCK,
+                            b->inverse + (size_t)l * DISTI_BLOCK);
     for (size_t u = 0; u < out; u++) {
         float *v = y + u * DISTI_BLOCK, *slope = b->slope ? b->slope + ((size_t)l * width + u) * DISTI_BLOCK : own;
         disti_activate(net->activation, scale, half, v, slope);
@@ -5258,8 +5260,8 @@ enum { DISTI_WIDE = 8, DISTI_WIDE_COLUMNS = DISTI_WIDE * DISTI_BLOCK };
 static size_t disti_wide_floats(const dist_context *ctx, const dist_net *net)
 {
     for (int l = 1; l + 1 < net->layers; l++)
-        if (!ctx->blas.sgemm_fn || net->layer[l].out < ctx->blas_width || net->layer[l].prev < ctx->blas_width) return 0;
-    if (net->normed || net->layers < 3) return 0;
+        if (DISTI_MIN(net->layer[l].out, net->layer[l].prev) < ctx->blas_width) return 0;
+    if (!ctx->blas.sgemm_fn || net->normed || net->layers < 3) return 0;
     return (size_t)(2 * net->max_rows + net->point_size) * DISTI_WIDE_COLUMNS;
 }
 

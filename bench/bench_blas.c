@@ -35,7 +35,7 @@ static const net_case cases[] = {{"8x512", 8, 512}, {"8x256", 8, 256}, {"8x128",
 enum { CASES = sizeof cases / sizeof cases[0], BATCHES = 7, LARGEST = 3072, WIDEST = 512, LAYERS = 8 };
 static const int batches[BATCHES] = {48, 96, 192, 384, 768, 1536, LARGEST};
 
-/* One chain of `layers` square layers after the first: what all but the first three and the last layer of a net cost. */
+/* `layers` - 1 square layers one after the other: what a net of that many hidden layers costs behind its first. */
 typedef struct chain {
     int layers, width, batch;
     float *weights[LAYERS], *bias, *x, *y;

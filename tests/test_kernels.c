@@ -302,14 +302,14 @@ static void check_outer_case(const disti_kernels *kernels, test_random *random, 
     release(before, n);
 }
 
-/* ReLU with its bits, every activation with its slope, LayerNorm and its adjoint, against the scalar kernels; where these
-   cannot be told from the formulas, see test_net and test_gradients. Numbers that are not finite do not spread. */
+/* ReLU with its bits, every activation with its slope, LayerNorm and its adjoint, against the scalar kernels,
+   which test_net and test_gradients hold against the formulas. */
 static void check_plain_case(const disti_kernels *kernels, test_random *random, test_size size)
 {
     const disti_kernels scalar = disti_kernels_for(DIST_ISA_SCALAR);
     const size_t n = (size_t)size.rows * TEST_BLOCK, rows = (size_t)size.rows;
-    float *x = floats(n), *a = floats(n), *b = floats(n), *slope_a = floats(n), *slope_b = floats(n), *gamma = floats(rows);
-    float *beta = floats(rows), inverse[2][TEST_BLOCK];
+    float *x = floats(n), *a = floats(n), *b = floats(n), *slope_a = floats(n), *slope_b = floats(n);
+    float *gamma = floats(rows), *beta = floats(rows), inverse[2][TEST_BLOCK];
     uint64_t mask[2][TEST_LONGEST];
     test_random_fill(random, n, x, -4.0f, 4.0f);
     test_random_fill(random, rows, gamma, -1.0f, 1.0f);

@@ -102,8 +102,8 @@ static void hook_sgemm(void *user, int ta, int tb, int m, int n, int k, float al
                        const float *b, int ldb, float beta, float *c, int ldc)
 {
     (void)user;
-    cblas_sgemm(CblasRowMajor, ta ? CblasTrans : CblasNoTrans, tb ? CblasTrans : CblasNoTrans, m, n, k, alpha, a, lda, b,
-                ldb, beta, c, ldc);
+    cblas_sgemm(CblasRowMajor, ta ? CblasTrans : CblasNoTrans, tb ? CblasTrans : CblasNoTrans, m, n, k, alpha, a, lda,
+                b, ldb, beta, c, ldc);
 }
 #endif
 
@@ -342,7 +342,8 @@ static void measure_chain(const settings *s, const net_case *k, int library, dou
         if (library == DNNL) { dnnl_end(&c, &d); }
 #endif
     }
-    print_row(k->name, library == KERNELS ? "kernels" : library == CBLAS ? "blas" : "onednn", best_batch, best * best_batch, chain_operations(&c), *peak);
+    static const char *const names[] = {"kernels", "blas", "onednn"};
+    print_row(k->name, names[library], best_batch, best * best_batch, chain_operations(&c), *peak);
     for (int l = 0; l < k->layers; l++) {
         free(c.weights[l]);
     }

@@ -29,10 +29,16 @@ static unsigned char wanted[MOST];
 
 /* What was found wrong, by kind. */
 enum { REFUSED, NOT_FINITE, OVER_BUDGET, COUNTS, FALSE_HIT, FALSE_MISS, BAD_BOUND, THREADS, GRADIENT, MEMORY, KINDS };
-static const char *const kind_names[KINDS] = {"refused without a sentence", "written, but not finite", "over the budget",
-                                              "counts do not add up", "hits that are none", "misses that are none",
-                                              "farther off than the bound", "bits differ between 1 and 3 workers",
-                                              "gradient not finite", "memory taken while rendering"};
+static const char *const kind_names[KINDS] = {"refused without a sentence",
+                                              "written, but not finite",
+                                              "over the budget",
+                                              "counts do not add up",
+                                              "hits that are none",
+                                              "misses that are none",
+                                              "farther off than the bound",
+                                              "bits differ between 1 and 3 workers",
+                                              "gradient not finite",
+                                              "memory taken while rendering"};
 static long found[KINDS], shallow_misses, hits_judged, misses_judged, bounds_judged, refusals, scenes;
 static unsigned long scene_now;
 
@@ -150,7 +156,9 @@ static test_shape random_shape(test_random *r)
     switch (test_random_int(r, 0, 8)) {
     case 0: return shape_make(SHAPE_SPHERE, test_random_double(r, 0.01, 0.95), 0, 0, 0);
     case 1: return shape_make(SHAPE_TORUS, test_random_double(r, 0.2, 0.6), log_uniform(r, -4, -0.6), 0, 0);
-    case 2: return shape_make(SHAPE_BOX, log_uniform(r, -5, -0.3), test_random_double(r, 0.1, 0.5), log_uniform(r, -5, -0.3), 0);
+    case 2:
+        return shape_make(SHAPE_BOX, log_uniform(r, -5, -0.3), test_random_double(r, 0.1, 0.5),
+                          log_uniform(r, -5, -0.3), 0);
     case 3: {
         double z = test_random_double(r, -1, 1), s = sqrt(1 - z * z);
         return shape_make(SHAPE_PLANE, s, 0, z, test_random_double(r, -0.8, 0.8));
@@ -158,7 +166,9 @@ static test_shape random_shape(test_random *r)
     case 4: return shape_make(SHAPE_RODS, log_uniform(r, -5, -1), 0, 0, 0);
     case 5: return shape_make(SHAPE_SHELLS, log_uniform(r, -6, -1.2), 0, 0, 0);
     case 6: return shape_make(SHAPE_BUMPY, 0.6, log_uniform(r, -4, -0.8), log_uniform(r, 0, 3), 0);
-    case 7: return shape_make(SHAPE_CONSTANT, (one_in(r, 2) ? 1 : -1) * (one_in(r, 4) ? 0 : log_uniform(r, -9, 1)), 0, 0, 0);
+    case 7:
+        return shape_make(SHAPE_CONSTANT, (one_in(r, 2) ? 1 : -1) * (one_in(r, 4) ? 0 : log_uniform(r, -9, 1)), 0, 0,
+                          0);
     default: return shape_make(SHAPE_PAIR, log_uniform(r, -7, -1), log_uniform(r, -7, -1), 0, 0);
     }
 }
@@ -177,8 +187,10 @@ static void random_field(test_random *r, scene *s)
     s->sane = bumps < 3;
     if (one_in(r, 3)) { /* a slope that the figure knows of, or not */
         f->shape.slope = log_uniform(r, -2, 3);
-        if (one_in(r, 2)) s->lipschitz = bumps * fmax(1, f->shape.slope);
-        else s->sane = s->sane && f->shape.slope <= 1;
+        if (one_in(r, 2))
+            s->lipschitz = bumps * fmax(1, f->shape.slope);
+        else
+            s->sane = s->sane && f->shape.slope <= 1;
     }
     if (one_in(r, 4)) {
         f->shape.clamp = log_uniform(r, -2, 0);
@@ -202,7 +214,8 @@ static void random_net(test_random *r, scene *s)
     s->net.code_size = one_in(r, 3) ? 0 : test_random_int(r, 1, CODE_MOST);
     s->net.activation = test_random_int(r, DIST_ACTIVATION_RELU, DIST_ACTIVATION_NONE);
     s->net.output_linear = one_in(r, 2);
-    s->net.geometric = (s->net.activation == DIST_ACTIVATION_RELU || s->net.activation == DIST_ACTIVATION_SOFTPLUS) && one_in(r, 2);
+    s->net.geometric =
+        (s->net.activation == DIST_ACTIVATION_RELU || s->net.activation == DIST_ACTIVATION_SOFTPLUS) && one_in(r, 2);
     s->net.seed = (unsigned)test_random_int(r, 1, 1000000);
     s->weight_scale = one_in(r, 3) ? log_uniform(r, -40, 38) : one_in(r, 2) ? log_uniform(r, -1, 2) : 1;
     s->code_scale = one_in(r, 3) ? log_uniform(r, -40, 38) : 0.1;
@@ -275,8 +288,10 @@ static void random_scene(unsigned long seed, scene *s)
 {
     test_random r = test_random_seed(seed * 2654435761u + 1);
     memset(s, 0, sizeof *s);
-    if (one_in(&r, 3)) random_net(&r, s);
-    else random_field(&r, s);
+    if (one_in(&r, 3))
+        random_net(&r, s);
+    else
+        random_field(&r, s);
     random_camera(&r, s);
     random_how(&r, s);
 }
@@ -439,7 +454,8 @@ static void judge_counts(const scene *s, const planes *p, const scene_field *own
     if (seen[DIST_RAY_UNRESOLVED] != t->unresolved || seen[DIST_RAY_INSIDE] != t->inside ||
         seen[DIST_RAY_PLATEAU] != t->plateau || seen[DIST_RAY_NOT_FINITE] != t->not_finite)
         note(COUNTS, "statuses", (double)t->unresolved, (double)seen[DIST_RAY_UNRESOLVED]);
-    if (t->queries != t->cone_queries + t->march_queries + t->refine_queries + t->silhouette_queries + t->normal_queries)
+    if (t->queries !=
+        t->cone_queries + t->march_queries + t->refine_queries + t->silhouette_queries + t->normal_queries)
         note(COUNTS, "queries", (double)t->queries, (double)t->march_queries);
     if (!s->is_net && s->planes & 64 && (unsigned long long)own->points != t->queries)
         note(COUNTS, "points", (double)t->queries, (double)own->points);
@@ -492,10 +508,12 @@ static void judge_truth(const scene *s, const planes *p, const scene_field *own)
         for (int k = 0; k < 3; k++) c[k] = o[k] - s->center[k];
         away = fmax(away, shape_length(c[0], c[1], c[2]));
         int meets = shape_enter(c, d, s->radius, &t0, &t1);
-        double t = (double)p->distance[i], rounding = 3e-7 * (fabs(t) + s->radius + fabs(s->center[0]) + fabs(s->center[1]) + fabs(s->center[2]));
+        double t = (double)p->distance[i],
+               rounding = 3e-7 * (fabs(t) + s->radius + fabs(s->center[0]) + fabs(s->center[1]) + fabs(s->center[2]));
         double epsilon = s->how.epsilon > 0 ? (double)s->how.epsilon : 5e-5 * (paper ? 1 : s->radius);
         epsilon = fmax(epsilon, 5e-7 * s->radius);
-        if (p->status[i] == DIST_RAY_HIT && !coarse && own->wild != WILD_HASH && own->wild != WILD_SPIKES && !(own->shape.poison > 0)) {
+        if (p->status[i] == DIST_RAY_HIT && !coarse && own->wild != WILD_HASH && own->wild != WILD_SPIKES &&
+            !(own->shape.poison > 0)) {
             double e = (double)p->error[i] + rounding;
             double a = value_at(own, o, d, t - e), m = value_at(own, o, d, t), b = value_at(own, o, d, t + e);
             double small = epsilon * (paper ? 1 + slope : 1.01) + 2 * slope * rounding;
@@ -507,8 +525,7 @@ static void judge_truth(const scene *s, const planes *p, const scene_field *own)
                 good = m <= small && m >= -small - 2 * slope * e;
             }
             int thin = rounding > 1e-4 * s->radius && own->shape.power < 0; /* a plate may lie between two samples */
-            if (!good && !thin)
-                note(FALSE_HIT, "f, error", m, (double)p->error[i]);
+            if (!good && !thin) note(FALSE_HIT, "f, error", m, (double)p->error[i]);
         }
         if (p->status[i] == DIST_RAY_INSIDE && own->wild == WILD_NONE && !(own->shape.poison > 0)) {
             double f = value_at(own, o, d, meets ? t0 : 0);
@@ -524,13 +541,16 @@ static void judge_truth(const scene *s, const planes *p, const scene_field *own)
         if (!x.crosses || x.below < deep || x.t * s->radius - t0 < 2 * rounding) continue;
         if (p->status[i] == DIST_RAY_MISS) {
             misses_judged++;
-            if (s->how.certified || x.below > 5e-3) note(FALSE_MISS, "deep, at", x.below, x.t);
-            else shallow_misses++;
+            if (s->how.certified || x.below > 5e-3)
+                note(FALSE_MISS, "deep, at", x.below, x.t);
+            else
+                shallow_misses++;
         } else {
             bounds_judged++;
             double e = (double)p->error[i] + 4 * rounding;
             int nearer = value_at(own, o, d, t - e) * value_at(own, o, d, t + e) <= 0; /* than the judge's steps see */
-            if (fabs(x.t * s->radius - t) > e && !nearer) note(BAD_BOUND, "off, error", fabs(x.t * s->radius - t), (double)p->error[i]);
+            if (fabs(x.t * s->radius - t) > e && !nearer)
+                note(BAD_BOUND, "off, error", fabs(x.t * s->radius - t), (double)p->error[i]);
         }
     }
 }

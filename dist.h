@@ -471,6 +471,7 @@ typedef struct dist_render_desc {
        looks, in lengths of its direction (1: from origin to origin + direction); 0: without end */
     int any_hit;
     float max_distance;
+    int warm_start;      /* 1: start from the picture in the tape, see dist_tape_create; guarded tracer */
     /* (height, width): only pixels that are not 0 are traced. Read during dist_render; NULL: all. dist_trace: NULL */
     const unsigned char *pixels;
     unsigned long long max_queries; /* queries of one call at most; 0: no limit. Shared out over the tiles by their
@@ -553,7 +554,16 @@ typedef struct dist_images {
 
 /* Keeps what the gradient needs: one distance and one status a pixel, and the paper's K samples where asked for. */
 typedef struct dist_tape dist_tape;
-/* For pictures of exactly this camera's size and of this desc's trace, paper_row and samples. */
+/* For pictures of exactly this camera's size and of this desc's trace, paper_row and samples.
+   With desc->warm_start the tape also keeps what the next picture can start from (8 bytes a pixel more). A dist_render
+   with warm_start then verifies the last picture's hits and near misses, one query each or none, instead of marching.
+   It is meant for an optimization that moves the surface by less than about a pixel a step. Whatever does not
+   verify, and every tile in which much has moved, is traced anew; so is the whole picture after a change of camera, of
+   field (the shape itself may get a new code) or of epsilon. What is certain: every hit lies on the surface within its
+   error bound, and what lies before the cones' stops (blocks of 8 x 8 pixels) is empty as far as the Lipschitz figure
+   is right, as in a cold render. Between there and the hit a surface that comes out of nothing is noticed at once if f
+   where the cones stop betrays it, else by the rays that are marched anew in turn: after 64 renders at the latest
+   (16 for pixels that were misses). */
 DIST_API dist_tape *dist_tape_create(dist_context *ctx, const dist_camera *camera, const dist_render_desc *desc);
 DIST_API void dist_tape_destroy(dist_tape *tape);
 
@@ -6898,6 +6908,7 @@ typedef struct disti_ray {
     unsigned char aim;   /* 1: the neighbors predict the hit at target, 2: but not how f falls there */
     float target, incline; /* s, df/ds there */
     float off;             /* of a hit: how far the neighbors' prediction was from it; 0: there was none */
+    unsigned char kept;  /* warm start: verified, not traced; a miss's best is where |f| is least */
 } disti_ray;
 
 enum {
@@ -6971,6 +6982,9 @@ static dist_status disti_how_check(dist_context *ctx, const dist_render_desc *ho
     if (!disti_finite(how->max_distance) || how->max_distance < 0.0f)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.max_distance is %d, must be 0 or positive", function,
                           (double)how->max_distance, 0);
+    if ((status = disti_choice(ctx, function, "warm_start", how->warm_start, how->trace == DIST_TRACE_GUARDED)) !=
+        DIST_OK)
+        return status;
     if (!disti_finite(how->step_scale) || how->step_scale < 0.0f || how->step_scale > 100.0f)
         return disti_fail(ctx, DIST_BAD_ARGUMENT,
                           "%s: how.step_scale is %d, must be above 0 (0: the default) and at most 100", function,
@@ -8354,7 +8368,7 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
    off by ds costs ds^2 / 2 times the curvature: first-order exact (envelope theorem). */
 static int disti_wants_minimum(const disti_ray *ray)
 {
-    return ray->status == DIST_RAY_MISS && ray->enter < ray->leave;
+    return ray->status == DIST_RAY_MISS && ray->enter < ray->leave && !ray->kept;
 }
 
 static void disti_keep_least(disti_ray *ray, float s, float f)
@@ -8752,6 +8766,9 @@ struct dist_tape {
     float *s; /* (pixels): hit, or sample of smallest |f|, measured from the closest approach to the center */
     unsigned char *status;  /* (pixels): DIST_RAY_*, with DISTI_TAPE_* bits */
     float *sample;          /* (pixels, samples, 4), paper's tracer only */
+    /* (pixels), warm start only: slope at a hit, |f| at a miss; where the cones stopped; disti_nearest_task's */
+    float *value, *start, *nearest;
+    unsigned turn;          /* warm renders so far */
     int rendered, has_silhouette;
     dist_field field;
     dist_camera camera;
@@ -8780,6 +8797,7 @@ static size_t disti_tape_bytes(const dist_tape *tape, int part)
         break;
     case 3: bytes = DISTI_CHUNK * sizeof(disti_entry); break;
     case 4: bytes = (DISTI_CHUNK * 7 + DISTI_RUN * 12) * sizeof(float); break;
+    case 5: good = good && disti_size_mul(pixels, 3 * sizeof(float), &bytes); break;
     }
     return good ? bytes : (size_t)-1;
 }
@@ -8790,6 +8808,7 @@ DIST_API void dist_tape_destroy(dist_tape *tape)
     disti_free(tape->ctx, tape->points, disti_tape_bytes(tape, 4));
     disti_free(tape->ctx, tape->entry, disti_tape_bytes(tape, 3));
     if (tape->sample) disti_free(tape->ctx, tape->sample, disti_tape_bytes(tape, 2));
+    if (tape->value) disti_free(tape->ctx, tape->value, disti_tape_bytes(tape, 5));
     disti_free(tape->ctx, tape->status, disti_tape_bytes(tape, 1));
     disti_free(tape->ctx, tape->s, disti_tape_bytes(tape, 0));
     disti_free(tape->ctx, tape, sizeof *tape);
@@ -8817,11 +8836,16 @@ DIST_API dist_tape *dist_tape_create(dist_context *ctx, const dist_camera *camer
     tape->status = tape->s ? (unsigned char *)disti_alloc(ctx, disti_tape_bytes(tape, 1)) : NULL;
     if (tape->status && raw.trace == DIST_TRACE_PAPER)
         tape->sample = (float *)disti_alloc(ctx, disti_tape_bytes(tape, 2));
+    if (tape->status && raw.warm_start) tape->value = (float *)disti_alloc(ctx, disti_tape_bytes(tape, 5));
     tape->entry = tape->status ? (disti_entry *)disti_alloc(ctx, disti_tape_bytes(tape, 3)) : NULL;
     tape->points = tape->entry ? (float *)disti_alloc(ctx, disti_tape_bytes(tape, 4)) : NULL;
-    if (!tape->points || (raw.trace == DIST_TRACE_PAPER && !tape->sample)) {
+    if (!tape->points || (raw.trace == DIST_TRACE_PAPER && !tape->sample) || (raw.warm_start && !tape->value)) {
         dist_tape_destroy(tape);
         return NULL;
+    }
+    if (tape->value) {
+        tape->start = tape->value + (size_t)tape->width * (size_t)tape->height;
+        tape->nearest = tape->start + (size_t)tape->width * (size_t)tape->height;
     }
     tape->d_sdf = tape->points + 3 * (size_t)DISTI_CHUNK;
     tape->d_points = tape->d_sdf + DISTI_CHUNK;
@@ -8860,6 +8884,8 @@ typedef struct disti_render_job {
     int tile, across;
     int predict; /* pixels start from what their neighbors found */
     int least;   /* misses need their smallest f: for the silhouette or the relaxed boundary */
+    int warm;    /* and from what the tape's picture found */
+    float step;  /* three pixels' width at the field's center */
     size_t first[DISTI_LIST_TASKS + 1]; /* disti_render_list: first pixel of each task */
     size_t each;                        /* and how many of them each has */
     int count;                          /* tasks */
@@ -9053,6 +9079,10 @@ static void disti_render_pixel(const disti_render_job *job, const disti_ray *ray
     if (!job->tape) return;
     int sampled = ray->enter < ray->leave && ray->fbest < 2e38f && ray->status != DIST_RAY_NOT_FINITE;
     job->tape->s[pixel] = ray->best;
+    if (!job->tape->value) return;
+    job->tape->start[pixel] = ray->kept ? DISTI_MIN(job->tape->start[pixel], ray->start) : ray->start;
+    /* a ray that was looking for the way out has no slope to start from */
+    job->tape->value[pixel] = ray->status != DIST_RAY_HIT ? ray->fbest : ray->sign > 0.0f ? ray->slope : 0.0f;
     job->tape->status[pixel] = (unsigned char)(ray->status | (ray->status == DIST_RAY_HIT ? DISTI_TAPE_HIT : 0) |
                                                (sampled ? DISTI_TAPE_SAMPLE : 0) |
                                                (sampled && ray->status == DIST_RAY_MISS && ray->fbest > 0.0f &&
@@ -9087,6 +9117,350 @@ static void disti_tile_trim(disti_tile *tile, const disti_bench *bench)
     tile->height = tile->own_height;
 }
 
+/* Warm start: a tile begins with what the tape's picture shows of it.
+
+   Hits. Every 8th pixel is looked for at its last distance; how far each moved, interpolated, predicts where the others
+   are. Half of them, like the black fields of a chessboard, take one query there (a step of Newton's with the last
+   slope ends it, as for a cold prediction); the others lie amid four that moved alike and are moved with them, else
+   they take a query, too. Next turn the colors change, so no error lives longer than one turn.
+   Misses. Where the cones stopped again, f at the sample of least |f| must stay above four times the largest change of f
+   seen in the tile; it is asked again when 1.5 times that change, taken off each turn, may have brought it near.
+   A hit that has a nearer one beside it, not of the same slant, may be covered by that: f at the nearer one's distance
+   must be more than four times the largest change, too.
+   All is off for rays where f at the cones' stop is too small for the surface expected (as in disti_predict) and the
+   cones prove less to be empty than when the ray was traced, and for tiles where the pixels marched anew (one hit in 64
+   each turn) or the first ones contradict what is expected. */
+enum { DISTI_WARM_HITS = 64, DISTI_WARM_MISSES = 16, DISTI_WARM_MINIMA = 8 };
+
+typedef struct disti_warm {
+    const dist_tape *tape;
+    const disti_tracer *tracer;
+    const disti_tile *tile;
+    const disti_bench *bench;
+    int worker, n, silhouette;
+    int known;            /* whether anything is known of the change */
+    float *moved;         /* of each pixel: how far its hit has moved; 3e38: not known */
+    unsigned char *open;  /* 1: not decided by the cones; 2: and its hit was not where it was looked for */
+    float change;         /* largest change of f */
+    size_t count;         /* of bench->index */
+} disti_warm;
+
+static size_t disti_warm_pixel(const disti_warm *warm, int i)
+{
+    return disti_tile_pixel(warm->tile, i);
+}
+
+/* Whether it is the pixel's turn to be marched anew: one of each 8 x 8 block (period 64), scattered. */
+static int disti_warm_due(const disti_warm *warm, int i, unsigned period)
+{
+    unsigned x = (unsigned)(i % warm->tile->width), y = (unsigned)(i / warm->tile->width);
+    return ((x % 8u + y % 8u * 8u) * 27u + warm->tape->turn) % period == 0;
+}
+
+/* Whether the cones prove the ray empty as far as when it was traced, with the last sphere beyond their stop. */
+static int disti_warm_reaches(const disti_warm *warm, int i)
+{
+    const disti_ray *ray = &warm->bench->rays[i];
+    return ray->start + ray->guard / warm->tracer->lipschitz >= warm->tape->start[disti_warm_pixel(warm, i)];
+}
+
+/* Whether the ray may be looked for near its last hit s. */
+static int disti_warm_expects(const disti_warm *warm, int i, float s)
+{
+    size_t pixel = disti_warm_pixel(warm, i);
+    const disti_ray *ray = &warm->bench->rays[i];
+    float slope = warm->tape->value[pixel];
+    if (warm->open[i] != 1 || ray->mode == DISTI_DONE || (warm->tape->status[pixel] & 15) != DIST_RAY_HIT) return 0;
+    if (!(slope < -0.04f * warm->tracer->lipschitz) || !(s > ray->start && s < ray->leave)) return 0;
+    if (ray->guard > 2e38f) return 0; /* no cone came here */
+    return -slope * (s - ray->start) <= ray->guard || disti_warm_reaches(warm, i);
+}
+
+static void disti_warm_change(disti_warm *warm, float change)
+{
+    warm->change = DISTI_MAX(warm->change, change < 0.0f ? -change : change);
+    warm->known = 1;
+}
+
+static void disti_warm_again(disti_warm *warm, int i)
+{
+    disti_ray *ray = &warm->bench->rays[i];
+    ray->status = DIST_RAY_MISS;
+    ray->mode = DISTI_FIRST;
+    ray->best = ray->q = ray->start;
+    ray->fbest = 3e38f;
+    ray->fb = ray->slope = ray->error = 0.0f;
+    ray->kept = 0;
+    warm->moved[i] = 3e38f;
+    warm->open[i] = 2;
+}
+
+static void disti_warm_hit(disti_warm *warm, int i, float s, float f, float error)
+{
+    disti_ray *ray = &warm->bench->rays[i];
+    disti_ray_end(ray, DIST_RAY_HIT, s, f, error);
+    ray->kept = 1;
+    warm->moved[i] = s - warm->tape->s[disti_warm_pixel(warm, i)];
+}
+
+/* Newton's steps for the rays of bench->index, from ray->q with the last slope, then with their own. What does not end
+   within four is left to be traced. */
+static void disti_warm_newton(disti_warm *warm)
+{
+    const disti_bench *bench = warm->bench;
+    float far = 0.03f * warm->tracer->field->radius, flat = -0.04f * warm->tracer->lipschitz;
+    for (int round = 0; round < 4 && warm->count > 0; round++) {
+        size_t count = warm->count;
+        for (size_t k = 0; k < count; k++) {
+            const disti_ray *ray = &bench->rays[bench->index[k]];
+            disti_ray_point(ray, ray->q, bench->points + 3 * k);
+        }
+        size_t asked = disti_query(warm->tracer, warm->worker, bench, count);
+        bench->stats->refine_queries += asked;
+        warm->count = 0;
+        for (size_t k = 0; k < count; k++) {
+            int i = bench->index[k];
+            disti_ray *ray = &bench->rays[i];
+            float f = k < asked ? bench->sdf[k] : 3e38f, epsilon = disti_ray_epsilon(warm->tracer, ray, ray->q);
+            float slope = round == 0 ? ray->slope : (f - ray->fa) / (ray->q - ray->a), step = -f / slope;
+            float length = step < 0.0f ? -step : step, moved = ray->q + step - warm->tape->s[disti_warm_pixel(warm, i)];
+            int good = disti_finite(step) && slope < flat && length < far && moved < far && moved > -far &&
+                       (round == 0 || (f < 0.0f ? -f : f) < ray->fa) && ray->q + step > ray->start;
+            ray->fa = f < 0.0f ? -f : f;
+            ray->slope = slope;
+            ray->a = ray->q;
+            ray->q += step;
+            if (good && length <= (round == 0 ? 4.0f : 12.0f) * epsilon) {
+                disti_warm_hit(warm, i, ray->q, f, 2.0f * length);
+                disti_warm_change(warm, moved * slope);
+            } else if (good && round < 3) {
+                bench->index[warm->count++] = i;
+            } else {
+                disti_warm_again(warm, i);
+            }
+        }
+    }
+    warm->count = 0;
+}
+
+/* Interpolated from the corners of the pixel's 8 x 8 block, as far as they are known. */
+static float disti_warm_guess(const disti_warm *warm, int i)
+{
+    int width = warm->tile->width, height = warm->tile->height, x = i % width, y = i / width;
+    float sum = 0.0f, weights = 0.0f;
+    for (int k = 0; k < 4; k++) {
+        int right = k & 1, down = k >> 1, cx = (x & ~7) + 8 * right, cy = (y & ~7) + 8 * down;
+        if (cx >= width || cy >= height || warm->moved[cy * width + cx] > 2e38f) continue;
+        float weight = (float)((right ? x & 7 : 8 - (x & 7)) * (down ? y & 7 : 8 - (y & 7)));
+        sum += weight * warm->moved[cy * width + cx];
+        weights += weight;
+    }
+    return weights > 0.0f ? sum / weights : 0.0f;
+}
+
+/* Mean of the four neighbors' moves; *spread gets how much they differ, 3e38 if one is not known. */
+static float disti_warm_between(const disti_warm *warm, int i, float *spread)
+{
+    int width = warm->tile->width, x = i % width, y = i / width;
+    *spread = 3e38f;
+    if (x == 0 || y == 0 || x + 1 == width || y + 1 == warm->tile->height) return 0.0f;
+    const float *m = warm->moved + i;
+    float low = DISTI_MIN(DISTI_MIN(m[-1], m[1]), DISTI_MIN(m[-width], m[width]));
+    float high = DISTI_MAX(DISTI_MAX(m[-1], m[1]), DISTI_MAX(m[-width], m[width]));
+    if (high < 2e38f) *spread = high - low;
+    return 0.25f * (m[-1] + m[1] + m[-width] + m[width]);
+}
+
+/* The hits: every 8th, then black, then white. 0: much has moved. */
+static int disti_warm_hits(disti_warm *warm)
+{
+    size_t tried = 0, good = 0;
+    for (int pass = 0; pass < 3; pass++) {
+        for (int i = 0; i < warm->n; i++) {
+            unsigned x = (unsigned)(i % warm->tile->width), y = (unsigned)(i / warm->tile->width);
+            if (pass == 0 ? (x | y) & 7u : (unsigned)(pass == 2) != ((x + y + warm->tape->turn) & 1u)) continue;
+            size_t pixel = disti_warm_pixel(warm, i);
+            float spread = 3e38f, s = warm->tape->s[pixel];
+            float move = pass == 2 ? disti_warm_between(warm, i, &spread) : 0.0f;
+            if (pass > 0 && spread > 2e38f) move = disti_warm_guess(warm, i);
+            if (!disti_warm_expects(warm, i, s + move) || disti_warm_due(warm, i, DISTI_WARM_HITS)) continue;
+            disti_ray *ray = &warm->bench->rays[i];
+            float epsilon = disti_ray_epsilon(warm->tracer, ray, s);
+            ray->slope = warm->tape->value[pixel];
+            ray->q = s + move;
+            if (spread <= 4.0f * epsilon) disti_warm_hit(warm, i, ray->q, 0.0f, 8.0f * epsilon + spread);
+            else warm->bench->index[warm->count++] = i;
+        }
+        if (pass == 0) tried = warm->count;
+        disti_warm_newton(warm);
+        for (int i = 0; i < warm->n && pass == 0; i++) good += warm->moved[i] < 2e38f;
+        if (4 * good < 3 * tried) return 0;
+    }
+    return 1;
+}
+
+/* The misses. With a silhouette their |f| is asked for near the outline, elsewhere every 4th turn, not at all where f
+   is clamped; and in one 4 x 4 block of eight the place of the least |f| is looked for anew. */
+static void disti_warm_misses(disti_warm *warm)
+{
+    const disti_bench *bench = warm->bench;
+    const dist_field *field = warm->tracer->field;
+    float clamp = field->clamp > 0.0f ? field->clamp : 0.1f * field->radius;
+    size_t count = 0;
+    for (int i = 0; i < warm->n; i++) {
+        size_t pixel = disti_warm_pixel(warm, i);
+        disti_ray *ray = &bench->rays[i];
+        unsigned x = (unsigned)(i % warm->tile->width), y = (unsigned)(i / warm->tile->width);
+        int blocked = warm->open[i] && ray->mode != DISTI_DONE;
+        if (warm->tape->status[pixel] != (DIST_RAY_MISS | DISTI_TAPE_SAMPLE)) continue;
+        if (!blocked && (warm->open[i] || ray->status != DIST_RAY_MISS || !(ray->enter < ray->leave))) continue;
+        float f = warm->tape->value[pixel], loss = 1.5f * warm->change;
+        float epsilon = disti_ray_epsilon(warm->tracer, ray, ray->start);
+        if (blocked && (ray->guard > 2e38f || !disti_warm_reaches(warm, i) || disti_warm_due(warm, i, DISTI_WARM_MISSES)))
+            continue;
+        int due = (x / 4u * 5u + y / 4u * 3u + warm->tape->turn) % DISTI_WARM_MINIMA == 0;
+        if (!blocked && warm->silhouette && due) continue;
+        int ask = blocked && (!warm->known || f - 8.0f * loss < 16.0f * warm->change + 4.0f * epsilon);
+        if (warm->silhouette && f < 0.98f * clamp) ask |= f < 0.2f * clamp || due || ((x ^ y) + warm->tape->turn) % 4u == 0;
+        ray->best = warm->tape->s[pixel];
+        if (ask) {
+            disti_ray_point(ray, ray->best, bench->points + 3 * count);
+            bench->index[count++] = i;
+        } else {
+            if (!warm->silhouette) f = DISTI_MAX(f - loss, 0.0f);
+            disti_ray_end(ray, DIST_RAY_MISS, ray->best, f, 0.0f);
+            ray->kept = 1;
+        }
+    }
+    count = disti_query(warm->tracer, warm->worker, bench, count);
+    *(warm->silhouette ? &bench->stats->silhouette_queries : &bench->stats->refine_queries) += count;
+    for (size_t k = 0; k < count; k++) {
+        float change = bench->sdf[k] - warm->tape->value[disti_warm_pixel(warm, bench->index[k])];
+        if (disti_finite(change) && (warm->silhouette || !warm->known)) disti_warm_change(warm, change);
+    }
+    for (size_t k = 0; k < count; k++) {
+        disti_ray *ray = &bench->rays[bench->index[k]];
+        float f = bench->sdf[k], epsilon = disti_ray_epsilon(warm->tracer, ray, ray->best);
+        if (!(f > 4.0f * (warm->change + epsilon))) continue; /* to be traced */
+        disti_ray_end(ray, DIST_RAY_MISS, ray->best, f, 0.0f);
+        int x = bench->index[k] % warm->tile->width, y = bench->index[k] / warm->tile->width;
+        ray->kept = !warm->silhouette || ((unsigned)(x / 4 * 5 + y / 4 * 3) + warm->tape->turn) % DISTI_WARM_MINIMA != 0;
+    }
+}
+
+/* Hits beside nearer ones: f at the nearer one's distance. Those that may be covered are marched anew. */
+static void disti_warm_covered(disti_warm *warm)
+{
+    const disti_bench *bench = warm->bench;
+    size_t count = 0, kept = 0;
+    for (int i = 0; i < warm->n; i++) {
+        disti_ray *ray = &bench->rays[i];
+        float s = warm->tape->nearest[disti_warm_pixel(warm, i)];
+        if (warm->moved[i] > 2e38f || s <= ray->start || s >= ray->best) continue;
+        disti_ray_point(ray, s, bench->points + 3 * count);
+        bench->index[count++] = i;
+    }
+    size_t asked = disti_query(warm->tracer, warm->worker, bench, count);
+    bench->stats->refine_queries += asked;
+    for (size_t k = 0; k < count; k++) {
+        float epsilon = disti_ray_epsilon(warm->tracer, &bench->rays[bench->index[k]], 0.0f);
+        if (k < asked && bench->sdf[k] > 4.0f * (warm->change + epsilon)) continue;
+        disti_warm_again(warm, bench->index[k]);
+        bench->index[kept++] = bench->index[k];
+    }
+    disti_trace_rounds(warm->tracer, warm->worker, bench, kept);
+}
+
+/* Marches the hits whose turn it is. 0: one of them is nearer than expected. */
+static int disti_warm_refresh(disti_warm *warm)
+{
+    const disti_bench *bench = warm->bench;
+    float far = 0.01f * warm->tracer->field->radius + 4.0f * warm->change;
+    size_t count = 0;
+    for (int i = 0; i < warm->n; i++) {
+        warm->moved[i] = 3e38f; /* from here on: where the ray was expected */
+        if (!disti_warm_due(warm, i, DISTI_WARM_HITS)) continue;
+        float s = warm->tape->s[disti_warm_pixel(warm, i)];
+        if (!disti_warm_expects(warm, i, s)) continue;
+        disti_warm_again(warm, i);
+        warm->moved[i] = s;
+        bench->index[count++] = i;
+    }
+    disti_trace_rounds(warm->tracer, warm->worker, bench, count);
+    for (int i = 0; i < warm->n; i++)
+        if (warm->moved[i] < 2e38f && bench->rays[i].status == DIST_RAY_HIT && bench->rays[i].best < warm->moved[i] - far)
+            return 0;
+    return 1;
+}
+
+static void disti_render_warm(const disti_render_job *job, int worker, const disti_tile *tile, const disti_bench *bench)
+{
+    disti_warm warm;
+    memset(&warm, 0, sizeof warm);
+    warm.tape = job->tape;
+    warm.tracer = job->tracer;
+    warm.tile = tile;
+    warm.bench = bench;
+    warm.worker = worker;
+    warm.n = tile->width * tile->height;
+    warm.silhouette = job->least;
+    warm.moved = (float *)(void *)bench->rest;
+    warm.open = bench->rest + (size_t)warm.n * sizeof(float);
+    for (int i = 0; i < warm.n; i++) {
+        warm.moved[i] = 3e38f;
+        warm.open[i] = bench->rays[i].mode != DISTI_DONE;
+    }
+    int good = disti_warm_hits(&warm);
+    if (good) {
+        disti_warm_misses(&warm);
+        disti_warm_covered(&warm);
+        good = disti_warm_refresh(&warm);
+    }
+    for (int i = 0; i < warm.n && !good; i++)
+        if (warm.open[i]) disti_warm_again(&warm, i);
+}
+
+/* What disti_warm_covered asks: for each hit the s of the nearest hit among its eight neighbors, if that is more than
+   three pixels nearer and the neighbor across is not as much farther; 3e38: none. */
+static void disti_nearest_task(void *arg, int index, int worker)
+{
+    const disti_render_job *job = (const disti_render_job *)arg;
+    const dist_tape *tape = job->tape;
+    const int dx[4] = {1, 0, 1, 1}, dy[4] = {0, 1, 1, -1};
+    (void)worker;
+    int last = DISTI_MIN((index + 1) * DISTI_TILE, tape->height);
+    for (int y = index * DISTI_TILE; y < last; y++) {
+        for (int x = 0; x < tape->width; x++) {
+            size_t pixel = (size_t)y * (size_t)tape->width + (size_t)x;
+            float s = tape->s[pixel], nearest = 3e38f;
+            for (int k = 0; k < 8 && tape->status[pixel] & DISTI_TAPE_HIT; k++) {
+                int side = k & 1 ? -1 : 1, ox = dx[k / 2] * side, oy = dy[k / 2] * side;
+                if (x + ox < 0 || x + ox >= tape->width || y + oy < 0 || y + oy >= tape->height) continue;
+                size_t other = (size_t)(y + oy) * (size_t)tape->width + (size_t)(x + ox);
+                float ahead = s - tape->s[other];
+                if (!(tape->status[other] & DISTI_TAPE_HIT) || ahead < job->step) continue;
+                int inside = x >= ox && x - ox < tape->width && y >= oy && y - oy < tape->height;
+                size_t across = inside ? (size_t)(y - oy) * (size_t)tape->width + (size_t)(x - ox) : pixel;
+                int steep = across != pixel && tape->status[across] & DISTI_TAPE_HIT && tape->s[across] - s > 0.3f * ahead;
+                if (!steep) nearest = DISTI_MIN(nearest, tape->s[other]);
+            }
+            tape->nearest[pixel] = nearest;
+        }
+    }
+}
+
+/* Whether the tape's picture can be started from: the same view of the same field, traced the same way. */
+static int disti_render_warms(const disti_tracer *tracer, const dist_camera *camera, const dist_tape *tape)
+{
+    const dist_field *a = tracer->field, *b = &tape->field;
+    const dist_render_desc *how = &tape->tracer.how;
+    return tape->rendered && memcmp(camera, &tape->camera, sizeof *camera) == 0 && a->eval_fn == b->eval_fn &&
+           a->user == b->user && memcmp(a->center, b->center, sizeof a->center) == 0 && a->radius >= b->radius &&
+           a->radius <= b->radius && tracer->epsilon >= tape->tracer.epsilon &&
+           tracer->epsilon <= tape->tracer.epsilon && how->inside == tracer->how.inside && !tracer->how.no_cones &&
+           !tracer->how.certified;
+}
+
 static void disti_render_task(void *arg, int index, int worker)
 {
     const disti_render_job *job = (const disti_render_job *)arg;
@@ -9105,7 +9479,7 @@ static void disti_render_task(void *arg, int index, int worker)
     disti_budget budget;
     disti_render_budget(job, &tile, &budget);
     if (tracer->how.max_queries > 0) bench.budget = &budget;
-    int predict = job->predict;
+    int predict = job->predict && !job->warm;
     if (predict && tile.x + tile.width < job->view->width) tile.width++;
     if (predict && tile.y + tile.height < job->view->height) tile.height++;
     int n = tile.width * tile.height;
@@ -9127,9 +9501,10 @@ static void disti_render_task(void *arg, int index, int worker)
         budget.left -= kept;
         for (int i = 0; i < DISTI_LEASTS; i++) bench.least_of->f[i] = 3e38f;
         if (!tracer->how.no_cones)
-            disti_cones(tracer, worker, &tile, &bench, predict ? (int)DISTI_LATTICE : (int)DISTI_CONE_LEAF);
+            disti_cones(tracer, worker, &tile, &bench, job->predict ? (int)DISTI_LATTICE : (int)DISTI_CONE_LEAF);
         budget.marching = 1;
-        if (predict) disti_trace_lattice(tracer, worker, &tile, &bench);
+        if (job->warm) disti_render_warm(job, worker, &tile, &bench);
+        if (job->predict) disti_trace_lattice(tracer, worker, &tile, &bench);
         else disti_trace_all(tracer, worker, &bench, (size_t)n);
         budget.marching = 0;
         disti_tile_trim(&tile, &bench);
@@ -9203,13 +9578,19 @@ static void disti_render_list_task(void *arg, int index, int worker)
     }
 }
 
+static double disti_view_away(const disti_view *view, const dist_field *field)
+{
+    double away[3];
+    for (int i = 0; i < 3; i++) away[i] = view->center[i] - (double)field->center[i];
+    return sqrt(disti_dot(away, away));
+}
+
 /* Neighbors say something about each other where pixels are near each other: a hundredth of the radius. */
 static int disti_render_predicts(const disti_tracer *tracer, const disti_view *view)
 {
-    double away[3], f = DISTI_MIN(fabs(view->fx), fabs(view->fy));
+    double f = DISTI_MIN(fabs(view->fx), fabs(view->fy));
     if (tracer->how.trace != DIST_TRACE_GUARDED || tracer->how.no_cones || tracer->how.no_prediction) return 0;
-    for (int i = 0; i < 3; i++) away[i] = view->center[i] - (double)tracer->field->center[i];
-    return sqrt(disti_dot(away, away)) < 0.01 * (double)tracer->field->radius * f;
+    return disti_view_away(view, tracer->field) < 0.01 * (double)tracer->field->radius * f;
 }
 
 DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, const dist_camera *camera,
@@ -9234,6 +9615,9 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     if (tape && (tape->width != camera->width || tape->height != camera->height))
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: tape is for another size than camera.width %d, height %d", name,
                           camera->width, camera->height);
+    if (tracer.how.warm_start && (!tape || !tape->value))
+        return disti_fail(ctx, DIST_BAD_ARGUMENT,
+                          "dist_render: how.warm_start is 1, but tape is %s", tape ? "not made with it" : "NULL", 0, 0);
     if (tape && (tape->trace != tracer.how.trace || (tape->sample && tape->samples != tracer.how.samples)))
         return disti_fail(ctx, DIST_BAD_ARGUMENT,
                           "%s: tape was created with another trace or another number of samples", name, 0, 0);
@@ -9251,6 +9635,9 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     int listed = disti_render_list(&tracer, &view, &job);
     job.count = listed ? listed : job.across * ((view.height + job.tile - 1) / job.tile);
     disti_sphere_box(&view, field, job.box);
+    job.warm = tracer.how.warm_start && !listed && disti_render_warms(&tracer, camera, tape);
+    job.step = (float)(6.0 * disti_view_footprint(&view, 1.0) * disti_view_away(&view, field));
+    if (job.warm) disti_run(ctx, (view.height + DISTI_TILE - 1) / DISTI_TILE, disti_nearest_task, &job);
     disti_run(ctx, job.count, listed ? disti_render_list_task : disti_render_task, &job);
     disti_stats_end(ctx, &tracer, out->stats);
     if (!tape) return DIST_OK;
@@ -9261,6 +9648,7 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     tape->tracer = tracer;
     tape->tracer.field = &tape->field;
     tape->tracer.how.pixels = NULL;
+    tape->turn = job.warm ? tape->turn + 1 : 0;
     return DIST_OK;
 }
 

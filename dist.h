@@ -562,8 +562,8 @@ typedef struct dist_tape dist_tape;
    field (the shape itself may get a new code) or of epsilon. What is certain: every hit lies on the surface within its
    error bound, and what lies before the cones' stops (blocks of 8 x 8 pixels) is empty as far as the Lipschitz figure
    is right, as in a cold render. Between there and the hit a surface that comes out of nothing is noticed at once if f
-   where the cones stop betrays it, else by the rays that are marched anew in turn: after 64 renders at the latest
-   (16 for pixels that were misses). */
+   where the cones stop betrays it, else by the rays that are marched anew in turn: after 128 renders at the latest
+   (64 for pixels that were misses). */
 DIST_API dist_tape *dist_tape_create(dist_context *ctx, const dist_camera *camera, const dist_render_desc *desc);
 DIST_API void dist_tape_destroy(dist_tape *tape);
 
@@ -6909,6 +6909,7 @@ typedef struct disti_ray {
     float target, incline; /* s, df/ds there */
     float off;             /* of a hit: how far the neighbors' prediction was from it; 0: there was none */
     unsigned char kept;  /* warm start: verified, not traced; a miss's best is where |f| is least */
+    float stop;          /* warm start: start as the cones left it */
 } disti_ray;
 
 enum {
@@ -9080,7 +9081,7 @@ static void disti_render_pixel(const disti_render_job *job, const disti_ray *ray
     int sampled = ray->enter < ray->leave && ray->fbest < 2e38f && ray->status != DIST_RAY_NOT_FINITE;
     job->tape->s[pixel] = ray->best;
     if (!job->tape->value) return;
-    job->tape->start[pixel] = ray->kept ? DISTI_MIN(job->tape->start[pixel], ray->start) : ray->start;
+    job->tape->start[pixel] = ray->kept ? DISTI_MIN(job->tape->start[pixel], ray->stop) : ray->stop;
     /* a ray that was looking for the way out has no slope to start from */
     job->tape->value[pixel] = ray->status != DIST_RAY_HIT ? ray->fbest : ray->sign > 0.0f ? ray->slope : 0.0f;
     job->tape->status[pixel] = (unsigned char)(ray->status | (ray->status == DIST_RAY_HIT ? DISTI_TAPE_HIT : 0) |
@@ -9120,17 +9121,19 @@ static void disti_tile_trim(disti_tile *tile, const disti_bench *bench)
 /* Warm start: a tile begins with what the tape's picture shows of it.
 
    Hits. Every 8th pixel is looked for at its last distance; how far each moved, interpolated, predicts where the others
-   are. Half of them, like the black fields of a chessboard, take one query there (a step of Newton's with the last
-   slope ends it, as for a cold prediction); the others lie amid four that moved alike and are moved with them, else
-   they take a query, too. Next turn the colors change, so no error lives longer than one turn.
-   Misses. Where the cones stopped again, f at the sample of least |f| must stay above four times the largest change of f
-   seen in the tile; it is asked again when 1.5 times that change, taken off each turn, may have brought it near.
-   A hit that has a nearer one beside it, not of the same slant, may be covered by that: f at the nearer one's distance
-   must be more than four times the largest change, too.
+   are. A quarter of them takes one query there (a step of Newton's with the last slope ends it, as for a cold
+   prediction); the others lie between such that moved alike, and are moved with them, else they take a query, too. The
+   quarters take turns, so no error lives longer than three turns.
+   Misses. Where the cones stopped again,
+       f at the sample of least |f| must stay above the largest change of f seen in the
+   tile; it is asked again when 1.5 times that change, taken off each turn, may have brought it near.
+   A hit that has a nearer one beside it, not of the same slant, may be covered by that: f must stay above the largest
+   change, too, from the nearer one's distance on until it rises.
    All is off for rays where f at the cones' stop is too small for the surface expected (as in disti_predict) and the
-   cones prove less to be empty than when the ray was traced, and for tiles where the pixels marched anew (one hit in 64
+   cones prove less to be empty than when the ray was traced,
+       and for tiles where the pixels marched anew (one hit in 128
    each turn) or the first ones contradict what is expected. */
-enum { DISTI_WARM_HITS = 64, DISTI_WARM_MISSES = 16, DISTI_WARM_MINIMA = 8 };
+enum { DISTI_WARM_HITS = 128, DISTI_WARM_MISSES = 64, DISTI_WARM_MINIMA = 8 };
 
 typedef struct disti_warm {
     const dist_tape *tape;
@@ -9150,11 +9153,11 @@ static size_t disti_warm_pixel(const disti_warm *warm, int i)
     return disti_tile_pixel(warm->tile, i);
 }
 
-/* Whether it is the pixel's turn to be marched anew: one of each 8 x 8 block (period 64), scattered. */
+/* Whether it is the pixel's turn to be marched anew: one of each 8 x 16 block (period 128), scattered. */
 static int disti_warm_due(const disti_warm *warm, int i, unsigned period)
 {
     unsigned x = (unsigned)(i % warm->tile->width), y = (unsigned)(i / warm->tile->width);
-    return ((x % 8u + y % 8u * 8u) * 27u + warm->tape->turn) % period == 0;
+    return ((x % 8u + y % 16u * 8u) * 27u + warm->tape->turn) % period == 0;
 }
 
 /* Whether the cones prove the ray empty as far as when it was traced, with the last sphere beyond their stop. */
@@ -9225,8 +9228,8 @@ static void disti_warm_newton(disti_warm *warm)
             float slope = round == 0 ? ray->slope : (f - ray->fa) / (ray->q - ray->a), step = -f / slope;
             float length = step < 0.0f ? -step : step, moved = ray->q + step - warm->tape->s[disti_warm_pixel(warm, i)];
             int good = disti_finite(step) && slope < flat && length < far && moved < far && moved > -far &&
-                       (round == 0 || (f < 0.0f ? -f : f) < ray->fa) && ray->q + step > ray->start;
-            ray->fa = f < 0.0f ? -f : f;
+                       (round == 0 || f * f < ray->fa * ray->fa) && ray->q + step > ray->start;
+            ray->fa = f;
             ray->slope = slope;
             ray->a = ray->q;
             ray->q += step;
@@ -9255,48 +9258,141 @@ static float disti_warm_guess(const disti_warm *warm, int i)
         sum += weight * warm->moved[cy * width + cx];
         weights += weight;
     }
-    return weights > 0.0f ? sum / weights : 0.0f;
+    return weights > 0.0f ? sum / weights : 3e38f;
 }
 
-/* Mean of the four neighbors' moves; *spread gets how much they differ, 3e38 if one is not known. */
+/* Whether the pixel is one of the quarter that is asked this turn. */
+static int disti_warm_asks(const disti_warm *warm, int x, int y)
+{
+    unsigned turn = warm->tape->turn & 3u, phase = turn ^ turn >> 1; /* two bits: the offset along x and y */
+    return ((unsigned)x & 1u) == (phase & 1u) && ((unsigned)y & 1u) == phase >> 1;
+}
+
+/* Mean of the moves of the pixels around that were asked, two beside it or four at its corners; *spread gets how much
+   they differ, 3e38 if too few are known. */
 static float disti_warm_between(const disti_warm *warm, int i, float *spread)
 {
-    int width = warm->tile->width, x = i % width, y = i / width;
-    *spread = 3e38f;
-    if (x == 0 || y == 0 || x + 1 == width || y + 1 == warm->tile->height) return 0.0f;
-    const float *m = warm->moved + i;
-    float low = DISTI_MIN(DISTI_MIN(m[-1], m[1]), DISTI_MIN(m[-width], m[width]));
-    float high = DISTI_MAX(DISTI_MAX(m[-1], m[1]), DISTI_MAX(m[-width], m[width]));
-    if (high < 2e38f) *spread = high - low;
-    return 0.25f * (m[-1] + m[1] + m[-width] + m[width]);
+    int width = warm->tile->width, height = warm->tile->height, x = i % width, y = i / width, known = 0, all = 0,
+        border = 0;
+    float low = 3e38f, high = -3e38f, sum = 0.0f;
+    for (int dy = -1; dy <= 1; dy++) {
+        for (int dx = -1; dx <= 1; dx++) {
+            if (!disti_warm_asks(warm, x + dx, y + dy)) continue;
+            all++;
+            if (x + dx < 0 || x + dx >= width || y + dy < 0 || y + dy >= height) {
+                border = 1;
+                continue;
+            }
+            float moved = warm->moved[i + dy * width + dx];
+            if (moved > 2e38f) continue;
+            known++;
+            low = DISTI_MIN(low, moved);
+            high = DISTI_MAX(high, moved);
+            sum += moved;
+        }
+    }
+    float mean = known > 0 ? sum / (float)known : 3e38f, guess = 3e38f;
+    if (border) guess = disti_warm_guess(warm, i);
+    if (known > 0 && guess < 2e38f) {
+        low = DISTI_MIN(low, guess);
+        high = DISTI_MAX(high, guess);
+    }
+    *spread = known > 0 && (known >= (all == 2 ? 2 : 3) || guess < 2e38f) ? high - low : 3e38f;
+    return mean;
 }
 
-/* The hits: every 8th, then black, then white. 0: much has moved. */
+/* The hits: every 8th, the quarter that is asked, the others. 0: much has moved. */
 static int disti_warm_hits(disti_warm *warm)
 {
     size_t tried = 0, good = 0;
+    float sum = 0.0f;
     for (int pass = 0; pass < 3; pass++) {
         for (int i = 0; i < warm->n; i++) {
-            unsigned x = (unsigned)(i % warm->tile->width), y = (unsigned)(i / warm->tile->width);
-            if (pass == 0 ? (x | y) & 7u : (unsigned)(pass == 2) != ((x + y + warm->tape->turn) & 1u)) continue;
+            int x = i % warm->tile->width, y = i / warm->tile->width;
+            if (pass == 0 ? (x | y) & 7 : disti_warm_asks(warm, x, y) == (pass == 2)) continue;
             size_t pixel = disti_warm_pixel(warm, i);
             float spread = 3e38f, s = warm->tape->s[pixel];
             float move = pass == 2 ? disti_warm_between(warm, i, &spread) : 0.0f;
             if (pass > 0 && spread > 2e38f) move = disti_warm_guess(warm, i);
+            if (move > 2e38f) move = 0.0f;
             if (!disti_warm_expects(warm, i, s + move) || disti_warm_due(warm, i, DISTI_WARM_HITS)) continue;
             disti_ray *ray = &warm->bench->rays[i];
             float epsilon = disti_ray_epsilon(warm->tracer, ray, s);
             ray->slope = warm->tape->value[pixel];
             ray->q = s + move;
-            if (spread <= 4.0f * epsilon) disti_warm_hit(warm, i, ray->q, 0.0f, 8.0f * epsilon + spread);
+            if (spread <= 5.0f * epsilon) disti_warm_hit(warm, i, ray->q, 0.0f, 8.0f * epsilon + 2.0f * spread);
             else warm->bench->index[warm->count++] = i;
         }
         if (pass == 0) tried = warm->count;
         disti_warm_newton(warm);
-        for (int i = 0; i < warm->n && pass == 0; i++) good += warm->moved[i] < 2e38f;
-        if (4 * good < 3 * tried) return 0;
+        for (int i = 0; i < warm->n && pass == 0; i++) {
+            if (warm->moved[i] > 2e38f) continue;
+            float change = warm->moved[i] * warm->tape->value[disti_warm_pixel(warm, i)];
+            sum += change < 0.0f ? -change : change;
+            good++;
+        }
+        if (4 * good < 3 * tried || sum > 4e-3f * warm->tracer->field->radius * (float)good) return 0;
     }
     return 1;
+}
+
+/* Whether it is the turn of the pixel's 4 x 4 block to have the places of its least |f| looked for anew. */
+static int disti_warm_minimum_due(const disti_warm *warm, int i)
+{
+    int x = i % warm->tile->width, y = i / warm->tile->width;
+    return ((unsigned)(x / 4 * 5 + y / 4 * 3) + warm->tape->turn) % DISTI_WARM_MINIMA == 0;
+}
+
+/* Near misses, the first `count` of bench->index: downhill, in strides that double, until f is more on both sides, and
+   the least of the parabola there. A ray is a miss if f is more than the largest change even there. */
+static void disti_warm_near(disti_warm *warm, size_t count)
+{
+    const disti_bench *bench = warm->bench;
+    for (size_t k = 0; k < count; k++) {
+        disti_ray *ray = &bench->rays[bench->index[k]];
+        ray->width = DISTI_MAX(0.5f * ray->fbest, 2e-3f * warm->tracer->field->radius);
+    }
+    for (int round = 0; round < 15 && count > 0; round++) {
+        int phase = round % 3;
+        size_t kept = 0;
+        for (size_t k = 0; k < count; k++) {
+            disti_ray *ray = &bench->rays[bench->index[k]];
+            if (phase == 0) {
+                ray->a = ray->best;
+                ray->fa = ray->fbest;
+            }
+            float ds = phase == 0   ? -ray->width
+                       : phase == 1 ? ray->width
+                                    : disti_parabola(ray->width, ray->b, ray->fa, ray->fb);
+            ray->q = DISTI_MIN(DISTI_MAX(ray->a + ds, ray->enter), ray->leave);
+            disti_ray_point(ray, ray->q, bench->points + 3 * k);
+        }
+        size_t asked = disti_query(warm->tracer, warm->worker, bench, count);
+        bench->stats->refine_queries += asked;
+        for (size_t k = 0; k < count; k++) {
+            int i = bench->index[k];
+            disti_ray *ray = &bench->rays[i];
+            float f = k < asked && disti_finite(bench->sdf[k]) ? bench->sdf[k] : -1.0f;
+            if (phase == 0) ray->b = f;
+            if (phase == 1) ray->fb = f;
+            if (f < ray->fbest) {
+                ray->best = ray->q;
+                ray->fbest = f;
+            }
+            float least = warm->change + 2.0f * disti_ray_epsilon(warm->tracer, ray, ray->best);
+            int lowest = ray->fa <= ray->b && ray->fa <= ray->fb;
+            if (ray->fbest <= least || (phase == 2 && round == 14 && !lowest)) {
+                disti_warm_again(warm, i);
+            } else if (phase == 2 && lowest) {
+                disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest, 0.0f);
+                ray->kept = 1;
+            } else {
+                if (phase == 2) ray->width *= 2.0f;
+                bench->index[kept++] = i;
+            }
+        }
+        count = kept;
+    }
 }
 
 /* The misses. With a silhouette their |f| is asked for near the outline, elsewhere every 4th turn, not at all where f
@@ -9306,7 +9402,7 @@ static void disti_warm_misses(disti_warm *warm)
     const disti_bench *bench = warm->bench;
     const dist_field *field = warm->tracer->field;
     float clamp = field->clamp > 0.0f ? field->clamp : 0.1f * field->radius;
-    size_t count = 0;
+    size_t count = 0, near = 0;
     for (int i = 0; i < warm->n; i++) {
         size_t pixel = disti_warm_pixel(warm, i);
         disti_ray *ray = &bench->rays[i];
@@ -9315,60 +9411,87 @@ static void disti_warm_misses(disti_warm *warm)
         if (warm->tape->status[pixel] != (DIST_RAY_MISS | DISTI_TAPE_SAMPLE)) continue;
         if (!blocked && (warm->open[i] || ray->status != DIST_RAY_MISS || !(ray->enter < ray->leave))) continue;
         float f = warm->tape->value[pixel], loss = 1.5f * warm->change;
+        /* the cones went through here: nothing is known of a ray that they do not clear any more */
+        if (blocked && !(f > 0.0f) && warm->tape->start[pixel] <= ray->enter) continue;
+        float aside = blocked ? warm->tape->nearest[pixel] : 3e38f;
         float epsilon = disti_ray_epsilon(warm->tracer, ray, ray->start);
-        if (blocked && (ray->guard > 2e38f || !disti_warm_reaches(warm, i) || disti_warm_due(warm, i, DISTI_WARM_MISSES)))
+        if (blocked && (ray->guard > 2e38f || !disti_warm_reaches(warm, i) ||
+            disti_warm_due(warm, i, DISTI_WARM_MISSES)))
             continue;
-        int due = (x / 4u * 5u + y / 4u * 3u + warm->tape->turn) % DISTI_WARM_MINIMA == 0;
+        int due = disti_warm_minimum_due(warm, i);
         if (!blocked && warm->silhouette && due) continue;
-        int ask = blocked && (!warm->known || f - 8.0f * loss < 16.0f * warm->change + 4.0f * epsilon);
-        if (warm->silhouette && f < 0.98f * clamp) ask |= f < 0.2f * clamp || due || ((x ^ y) + warm->tape->turn) % 4u == 0;
-        ray->best = warm->tape->s[pixel];
+        float lower = warm->silhouette ? f - 8.0f * loss : f - loss;
+        int ask = blocked && (!warm->known || lower < 8.0f * warm->change + 4.0f * epsilon || aside < 2e38f);
+        if (warm->silhouette && f < 0.98f * clamp) ask |= f < 0.2f * clamp || due ||
+            ((x ^ y) + warm->tape->turn) % 4u == 0;
+        ray->best = aside < 2e38f ? aside : warm->tape->s[pixel];
         if (ask) {
             disti_ray_point(ray, ray->best, bench->points + 3 * count);
             bench->index[count++] = i;
         } else {
-            if (!warm->silhouette) f = DISTI_MAX(f - loss, 0.0f);
-            disti_ray_end(ray, DIST_RAY_MISS, ray->best, f, 0.0f);
+            disti_ray_end(ray, DIST_RAY_MISS, ray->best, warm->silhouette ? f : DISTI_MAX(lower, 0.0f), 0.0f);
             ray->kept = 1;
         }
     }
     count = disti_query(warm->tracer, warm->worker, bench, count);
     *(warm->silhouette ? &bench->stats->silhouette_queries : &bench->stats->refine_queries) += count;
     for (size_t k = 0; k < count; k++) {
-        float change = bench->sdf[k] - warm->tape->value[disti_warm_pixel(warm, bench->index[k])];
-        if (disti_finite(change) && (warm->silhouette || !warm->known)) disti_warm_change(warm, change);
+        size_t pixel = disti_warm_pixel(warm, bench->index[k]);
+        float change = warm->tape->value[pixel] - bench->sdf[k]; /* value may have been lowered: only a fall tells */
+        int measured = warm->tape->value[pixel] > 0.0f && warm->tape->nearest[pixel] > 2e38f;
+        if (disti_finite(change) && measured && (change > 0.0f || !warm->known)) disti_warm_change(warm, change);
     }
     for (size_t k = 0; k < count; k++) {
         disti_ray *ray = &bench->rays[bench->index[k]];
         float f = bench->sdf[k], epsilon = disti_ray_epsilon(warm->tracer, ray, ray->best);
-        if (!(f > 4.0f * (warm->change + epsilon))) continue; /* to be traced */
-        disti_ray_end(ray, DIST_RAY_MISS, ray->best, f, 0.0f);
-        int x = bench->index[k] % warm->tile->width, y = bench->index[k] / warm->tile->width;
-        ray->kept = !warm->silhouette || ((unsigned)(x / 4 * 5 + y / 4 * 3) + warm->tape->turn) % DISTI_WARM_MINIMA != 0;
+        size_t pixel = disti_warm_pixel(warm, bench->index[k]);
+        int measured = warm->tape->value[pixel] > 0.0f && warm->tape->nearest[pixel] > 2e38f;
+        ray->fbest = f;
+        if (f > (measured ? 0.0f : 0.03f * field->radius) + 5.0f * (warm->change + epsilon)) {
+            disti_ray_end(ray, DIST_RAY_MISS, ray->best, f, 0.0f);
+            ray->kept = !warm->silhouette || !disti_warm_minimum_due(warm, bench->index[k]);
+        } else if (f > 0.0f) {
+            bench->index[near++] = bench->index[k];
+        }
     }
+    disti_warm_near(warm, near);
 }
 
-/* Hits beside nearer ones: f at the nearer one's distance. Those that may be covered are marched anew. */
+/* Hits beside nearer ones: spheres from the nearer one's distance on until f rises again or is what the hit alone
+   makes it. Those that may be covered are marched anew. */
 static void disti_warm_covered(disti_warm *warm)
 {
     const disti_bench *bench = warm->bench;
-    size_t count = 0, kept = 0;
+    size_t count = 0, again = 0;
+    int *redo = (int *)(void *)(warm->open + 2 * DISTI_TILE * DISTI_TILE);
     for (int i = 0; i < warm->n; i++) {
         disti_ray *ray = &bench->rays[i];
         float s = warm->tape->nearest[disti_warm_pixel(warm, i)];
         if (warm->moved[i] > 2e38f || s <= ray->start || s >= ray->best) continue;
-        disti_ray_point(ray, s, bench->points + 3 * count);
+        ray->q = s;
+        ray->f = 3e38f;
         bench->index[count++] = i;
     }
-    size_t asked = disti_query(warm->tracer, warm->worker, bench, count);
-    bench->stats->refine_queries += asked;
-    for (size_t k = 0; k < count; k++) {
-        float epsilon = disti_ray_epsilon(warm->tracer, &bench->rays[bench->index[k]], 0.0f);
-        if (k < asked && bench->sdf[k] > 4.0f * (warm->change + epsilon)) continue;
-        disti_warm_again(warm, bench->index[k]);
-        bench->index[kept++] = bench->index[k];
+    for (int round = 0; count > 0; round++) {
+        size_t kept = 0;
+        for (size_t k = 0; k < count; k++)
+            disti_ray_point(&bench->rays[bench->index[k]], bench->rays[bench->index[k]].q, bench->points + 3 * k);
+        size_t asked = disti_query(warm->tracer, warm->worker, bench, count);
+        bench->stats->refine_queries += asked;
+        for (size_t k = 0; k < count; k++) {
+            disti_ray *ray = &bench->rays[bench->index[k]];
+            float f = k < asked ? bench->sdf[k] : 0.0f, epsilon = disti_ray_epsilon(warm->tracer, ray, ray->q);
+            float step = f / warm->tracer->lipschitz;
+            if (!(f > warm->change + 2.0f * epsilon) || round > 16) redo[again++] = bench->index[k];
+            else if (f < ray->f && f < -0.7f * ray->slope * (ray->best - ray->q))
+                bench->index[kept++] = bench->index[k];
+            ray->f = f;
+            ray->q += step;
+        }
+        count = kept;
     }
-    disti_trace_rounds(warm->tracer, warm->worker, bench, kept);
+    for (size_t k = 0; k < again; k++) disti_warm_again(warm, bench->index[k] = redo[k]);
+    disti_trace_rounds(warm->tracer, warm->worker, bench, again);
 }
 
 /* Marches the hits whose turn it is. 0: one of them is nearer than expected. */
@@ -9388,7 +9511,8 @@ static int disti_warm_refresh(disti_warm *warm)
     }
     disti_trace_rounds(warm->tracer, warm->worker, bench, count);
     for (int i = 0; i < warm->n; i++)
-        if (warm->moved[i] < 2e38f && bench->rays[i].status == DIST_RAY_HIT && bench->rays[i].best < warm->moved[i] - far)
+        if (warm->moved[i] < 2e38f && bench->rays[i].status == DIST_RAY_HIT &&
+            bench->rays[i].best < warm->moved[i] - far)
             return 0;
     return 1;
 }
@@ -9420,8 +9544,35 @@ static void disti_render_warm(const disti_render_job *job, int worker, const dis
         if (warm.open[i]) disti_warm_again(&warm, i);
 }
 
+/* Misses that were traced have no sample where |f| is least,
+    and those that other rays' spheres cover none at all: these
+   get their neighbor's place, and f = 0 says that the least is to be looked for next time. */
+static void disti_warm_seed(const disti_tile *tile, const disti_bench *bench)
+{
+    int n = tile->width * tile->height;
+    for (int pass = 0; pass < 2; pass++) {
+        for (int k = 0; k < n; k++) {
+            int i = pass ? n - 1 - k : k, x = i % tile->width, y = i / tile->width, side = pass ? 1 : -1;
+            disti_ray *ray = &bench->rays[i];
+            if (ray->status != DIST_RAY_MISS || ray->fbest < 2e38f || !(ray->enter < ray->leave)) continue;
+            for (int axis = 0; axis < 2; axis++) {
+                if (axis ? y + side < 0 || y + side >= tile->height : x + side < 0 || x + side >= tile->width) continue;
+                const disti_ray *other = ray + (axis ? side * tile->width : side);
+                if (other->fbest > 2e38f || other->status > DIST_RAY_HIT) continue;
+                float s = (float)(other->base + (double)other->best - ray->base);
+                ray->best = DISTI_MIN(DISTI_MAX(s, ray->enter), ray->leave);
+                ray->fbest = 0.0f;
+            }
+        }
+    }
+    for (int i = 0; i < n; i++)
+        if (bench->rays[i].status == DIST_RAY_MISS && bench->rays[i].fbest < 2e38f && !bench->rays[i].kept)
+            bench->rays[i].fbest = 0.0f;
+}
+
 /* What disti_warm_covered asks: for each hit the s of the nearest hit among its eight neighbors, if that is more than
-   three pixels nearer and the neighbor across is not as much farther; 3e38: none. */
+   three pixels nearer and the neighbor across is not as much farther; for each miss that of the hit beside it, if that
+   is more than three pixels away from its own place; 3e38: none. */
 static void disti_nearest_task(void *arg, int index, int worker)
 {
     const disti_render_job *job = (const disti_render_job *)arg;
@@ -9433,15 +9584,26 @@ static void disti_nearest_task(void *arg, int index, int worker)
         for (int x = 0; x < tape->width; x++) {
             size_t pixel = (size_t)y * (size_t)tape->width + (size_t)x;
             float s = tape->s[pixel], nearest = 3e38f;
-            for (int k = 0; k < 8 && tape->status[pixel] & DISTI_TAPE_HIT; k++) {
+            int hit = tape->status[pixel] & DISTI_TAPE_HIT,
+                none = tape->status[pixel] != (DIST_RAY_MISS | DISTI_TAPE_SAMPLE);
+            float closest = 3e38f;
+            for (int k = 0; k < 8 && (hit || !none); k++) {
                 int side = k & 1 ? -1 : 1, ox = dx[k / 2] * side, oy = dy[k / 2] * side;
                 if (x + ox < 0 || x + ox >= tape->width || y + oy < 0 || y + oy >= tape->height) continue;
                 size_t other = (size_t)(y + oy) * (size_t)tape->width + (size_t)(x + ox);
                 float ahead = s - tape->s[other];
-                if (!(tape->status[other] & DISTI_TAPE_HIT) || ahead < job->step) continue;
+                if (!(tape->status[other] & DISTI_TAPE_HIT)) continue;
+                if (!hit) {
+                    float off = ahead < 0.0f ? -ahead : ahead;
+                    if (off < closest) nearest = off > job->step ? tape->s[other] : 3e38f;
+                    closest = DISTI_MIN(closest, off);
+                    continue;
+                }
+                if (ahead < job->step) continue;
                 int inside = x >= ox && x - ox < tape->width && y >= oy && y - oy < tape->height;
                 size_t across = inside ? (size_t)(y - oy) * (size_t)tape->width + (size_t)(x - ox) : pixel;
-                int steep = across != pixel && tape->status[across] & DISTI_TAPE_HIT && tape->s[across] - s > 0.3f * ahead;
+                int steep = across != pixel && tape->status[across] & DISTI_TAPE_HIT &&
+                    tape->s[across] - s > 0.3f * ahead;
                 if (!steep) nearest = DISTI_MIN(nearest, tape->s[other]);
             }
             tape->nearest[pixel] = nearest;
@@ -9503,6 +9665,7 @@ static void disti_render_task(void *arg, int index, int worker)
         if (!tracer->how.no_cones)
             disti_cones(tracer, worker, &tile, &bench, job->predict ? (int)DISTI_LATTICE : (int)DISTI_CONE_LEAF);
         budget.marching = 1;
+        for (int i = 0; i < n && job->tape; i++) bench.rays[i].stop = bench.rays[i].start;
         if (job->warm) disti_render_warm(job, worker, &tile, &bench);
         if (job->predict) disti_trace_lattice(tracer, worker, &tile, &bench);
         else disti_trace_all(tracer, worker, &bench, (size_t)n);
@@ -9511,6 +9674,7 @@ static void disti_render_task(void *arg, int index, int worker)
         disti_trace_end(tracer, &bench, (size_t)(tile.width * tile.height));
         budget.left += kept;
         if (job->least) disti_silhouette(tracer, worker, &tile, &bench);
+        else if (job->tape && job->tape->value) disti_warm_seed(&tile, &bench);
     }
     disti_render_planes(job, &tile, &bench);
     if (job->out->normal) disti_render_normals(job, worker, &tile, &bench);
@@ -9593,6 +9757,32 @@ static int disti_render_predicts(const disti_tracer *tracer, const disti_view *v
     return disti_view_away(view, tracer->field) < 0.01 * (double)tracer->field->radius * f;
 }
 
+/* Whether the surface is still about where the tape has it: f at up to 1024 of its hits, evenly over the picture, is
+   less than 4e-3 radii in the mean. */
+static int disti_render_near(const disti_tracer *tracer, const disti_view *view, dist_tape *tape)
+{
+    enum { SIDE = 32 };
+    int dx = (view->width + SIDE - 1) / SIDE, dy = (view->height + SIDE - 1) / SIDE;
+    size_t count = 0;
+    double local[3], sum = 0.0;
+    disti_bench bench;
+    for (int y = dy / 2; y < view->height; y += dy) {
+        for (int x = dx / 2; x < view->width; x += dx) {
+            size_t pixel = (size_t)y * (size_t)view->width + (size_t)x;
+            disti_ray ray;
+            if (!(tape->status[pixel] & DISTI_TAPE_HIT)) continue;
+            disti_pixel_ray(view, tracer->field, x, y, local, &ray);
+            disti_ray_point(&ray, tape->s[pixel], tape->points + 3 * count++);
+        }
+    }
+    disti_field_eval_all(tracer->ctx, tracer->field, count, tape->points, tape->d_sdf, NULL);
+    disti_bench_init(tracer->ctx, 0, &bench);
+    bench.stats->queries += count;
+    bench.stats->refine_queries += count;
+    for (size_t i = 0; i < count; i++) sum += fabs((double)tape->d_sdf[i]);
+    return count > 0 && sum <= 4e-3 * (double)tracer->field->radius * (double)count;
+}
+
 DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, const dist_camera *camera,
                                  const dist_render_desc *desc, const dist_images *out, dist_tape *tape)
 {
@@ -9637,6 +9827,7 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     disti_sphere_box(&view, field, job.box);
     job.warm = tracer.how.warm_start && !listed && disti_render_warms(&tracer, camera, tape);
     job.step = (float)(6.0 * disti_view_footprint(&view, 1.0) * disti_view_away(&view, field));
+    if (job.warm) job.warm = disti_render_near(&tracer, &view, tape);
     if (job.warm) disti_run(ctx, (view.height + DISTI_TILE - 1) / DISTI_TILE, disti_nearest_task, &job);
     disti_run(ctx, job.count, listed ? disti_render_list_task : disti_render_task, &job);
     disti_stats_end(ctx, &tracer, out->stats);
@@ -9728,7 +9919,8 @@ static void disti_render_seed(void *user, size_t first, size_t count, const floa
     }
 }
 
-/* The one place where a pixel's share reaches the camera. p: a point on a ray, where it is for this camera; y = dL/dp as
+/* The one place where a pixel's share reaches the camera. p: a point on a ray,
+    where it is for this camera; y = dL/dp as
    the camera moves and p keeps its distance t along its ray; d_z: dL/d(z of p in camera space) from elsewhere (depth
    is t times the unit ray's z), which then only the ray's own tilt changes. In camera space, with Y = R y:
 

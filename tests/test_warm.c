@@ -1,0 +1,210 @@
+/* SPDX-License-Identifier: MIT-0
+   Warm start: a picture that starts from the last one is the picture that a cold render gives, for less. */
+#include "shapes.h"
+
+enum { SIDE = 256, PIXELS = SIDE * SIDE };
+
+typedef struct picture {
+    float distance[PIXELS], error[PIXELS], silhouette[PIXELS];
+    unsigned char mask[PIXELS];
+    dist_stats stats;
+} picture;
+
+static picture cold, warm;
+
+typedef struct scene {
+    dist_context *ctx;
+    dist_camera camera;
+    dist_field field;
+    dist_render_desc how; /* warm */
+    dist_tape *tape;
+    float numbers[5];
+} scene;
+
+static void scene_open(scene *s)
+{
+    const float torus[5] = {0, 0, 0, 0.55f, 0.2f}; /* the hole in it makes outlines before outlines */
+    memset(s, 0, sizeof *s);
+    memcpy(s->numbers, torus, sizeof torus);
+    s->ctx = shape_context();
+    s->camera = shape_camera(SIDE, SIDE);
+    s->field = dist_field_torus(s->numbers);
+    s->field.center[0] = s->field.center[1] = s->field.center[2] = 0;
+    s->field.radius = 1;
+    s->how.warm_start = 1;
+    s->tape = dist_tape_create(s->ctx, &s->camera, &s->how);
+}
+
+static void scene_close(scene *s)
+{
+    dist_tape_destroy(s->tape);
+    dist_context_destroy(s->ctx);
+}
+
+static void render(scene *s, int is_warm, int silhouette, picture *p)
+{
+    dist_images out;
+    dist_render_desc how = s->how;
+    memset(&out, 0, sizeof out);
+    how.warm_start = is_warm;
+    out.distance = p->distance;
+    out.error = p->error;
+    out.mask = p->mask;
+    out.silhouette = silhouette ? p->silhouette : NULL;
+    out.stats = &p->stats;
+    CHECK_STATUS(DIST_OK, dist_render(s->ctx, &s->field, &s->camera, &how, &out, is_warm ? s->tape : NULL), s->ctx);
+}
+
+/* Both pictures show the same but for single pixels, one in `share` at most, whose ray touches the surface or a
+   crease. */
+static void check_same(int silhouette, int share)
+{
+    int hits = 0, other = 0, far = 0, off = 0, near = 0;
+    for (int i = 0; i < PIXELS; i++) {
+        hits += cold.mask[i];
+        other += cold.mask[i] != warm.mask[i];
+        if (cold.mask[i] && warm.mask[i])
+            far += fabsf(cold.distance[i] - warm.distance[i]) > cold.error[i] + warm.error[i] + 1e-5f;
+        if (!silhouette || cold.mask[i] || warm.mask[i] || cold.silhouette[i] > 0.02f) continue;
+        near++;
+        off += fabsf(cold.silhouette[i] - warm.silhouette[i]) > 1e-3f;
+    }
+    CHECK(hits > PIXELS / 20);
+    CHECK(other * share <= hits);
+    CHECK(far * 500 <= hits);
+    CHECK(off * 20 <= near);
+}
+
+TEST(a_hundred_small_steps_do_not_drift_and_cost_little)
+{
+    for (int silhouette = 0; silhouette < 2; silhouette++) {
+        scene s;
+        unsigned long long queries = 0, hits = 0;
+        scene_open(&s);
+        for (int i = 0; i <= 100; i++) {
+            s.numbers[0] = 0.0005f * (float)i;
+            s.numbers[2] = 0.0003f * (float)i;
+            render(&s, 1, silhouette, &warm);
+            queries += i ? warm.stats.queries : 0;
+            hits += i ? warm.stats.hits : 0;
+            if (i % 25) continue;
+            render(&s, 0, silhouette, &cold);
+            check_same(silhouette, 1000);
+            if (i) CHECK(warm.stats.queries < cold.stats.queries * 2 / 3);
+        }
+        if (!silhouette) CHECK((double)queries < 1.5 * (double)hits);
+        scene_close(&s);
+    }
+}
+
+TEST(larger_steps_out_of_pixels_and_into_them_are_seen_at_once)
+{
+    scene s;
+    scene_open(&s);
+    for (int i = 0; i < 24; i++) {
+        s.numbers[0] = 0.2f * sinf(0.4f * (float)i);
+        s.numbers[1] = i > 12 ? 0.25f : 0.0f; /* one jump */
+        s.numbers[4] = 0.2f + 0.002f * (float)(i % 5);
+        render(&s, 1, 0, &warm);
+        render(&s, 0, 0, &cold);
+        check_same(0, 500);
+    }
+    scene_close(&s);
+}
+
+/* Two spheres: the second comes out of nothing, before the first, beside it and far away from it. */
+static float second[4];
+
+static void pair_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    (void)worker;
+    (void)gradient;
+    for (size_t i = 0; i < n; i++) {
+        const float *p = points + 3 * i, *b = second;
+        float f = sqrtf(p[0] * p[0] + p[1] * p[1] + p[2] * p[2]) - *(const float *)user;
+        float x = p[0] - b[0], y = p[1] - b[1], z = p[2] - b[2];
+        float g = sqrtf(x * x + y * y + z * z) - b[3];
+        sdf[i] = f < g ? f : g;
+    }
+}
+
+TEST(what_comes_out_of_nothing_is_seen_at_once)
+{
+    const float places[3][3] = {{0.45f, 0.3f, 0.6f}, {0.0f, 0.6f, 0.0f}, {-0.6f, -0.6f, 0.2f}};
+    for (int k = 0; k < 3; k++) {
+        scene s;
+        float radius = 0.4f;
+        scene_open(&s);
+        s.field.user = &radius;
+        s.field.eval_fn = pair_eval;
+        memcpy(second, places[k], sizeof places[k]);
+        for (int i = 0; i < 8; i++) {
+            second[3] = i < 3 ? -0.3f : 0.06f + 0.002f * (float)i;
+            for (int j = 0; j < (i == 7 ? 64 : 1); j++) render(&s, 1, 0, &warm); /* by then every miss had its turn */
+            render(&s, 0, 0, &cold);
+            check_same(0, i == 7 || i < 3 ? 1000 : 250); /* pixels of its outline may come late */
+        }
+        scene_close(&s);
+    }
+}
+
+TEST(another_camera_or_field_is_a_cold_start)
+{
+    scene s;
+    const float turn[3] = {0, 0.02f, 0};
+    float other[5] = {0.1f, 0, 0, 0.5f, 0.2f};
+    scene_open(&s);
+    for (int k = 0; k < 2; k++) {
+        render(&s, 1, 0, &warm);
+        render(&s, 1, 0, &warm);
+        if (k == 0) dist_camera_move(&s.camera, turn, NULL);
+        if (k == 1) s.field.user = other;
+        render(&s, 1, 0, &warm);
+        render(&s, 0, 0, &cold);
+        CHECK_EQUAL(cold.stats.queries, warm.stats.queries);
+        CHECK_BYTES(sizeof cold.distance, cold.distance, warm.distance);
+    }
+    scene_close(&s);
+}
+
+TEST(a_warm_start_needs_its_tape)
+{
+    scene s;
+    dist_images out;
+    dist_render_desc how;
+    scene_open(&s);
+    memset(&out, 0, sizeof out);
+    memset(&how, 0, sizeof how);
+    out.mask = warm.mask;
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_render(s.ctx, &s.field, &s.camera, &s.how, &out, NULL), s.ctx);
+    CHECK_TEXT("warm_start", dist_context_message(s.ctx));
+    dist_context_clear(s.ctx);
+    dist_tape *plain = dist_tape_create(s.ctx, &s.camera, &how);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_render(s.ctx, &s.field, &s.camera, &s.how, &out, plain), s.ctx);
+    dist_context_clear(s.ctx);
+    dist_tape_destroy(plain);
+    dist_camera small = shape_camera(SIDE / 2, SIDE);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_render(s.ctx, &s.field, &small, &s.how, &out, s.tape), s.ctx);
+    dist_context_clear(s.ctx);
+    how = s.how;
+    how.trace = DIST_TRACE_PAPER;
+    CHECK(dist_tape_create(s.ctx, &s.camera, &how) == NULL);
+    dist_context_clear(s.ctx);
+    render(&s, 0, 0, &cold);
+    /* cold into a warm tape */
+    CHECK_STATUS(DIST_OK, dist_render(s.ctx, &s.field, &s.camera, NULL, &out, s.tape), s.ctx);
+    render(&s, 1, 0, &warm);
+    CHECK(warm.stats.queries < cold.stats.queries);
+    scene_close(&s);
+}
+
+int main(int argc, char **argv)
+{
+    test_begin(argc, argv);
+    RUN(a_hundred_small_steps_do_not_drift_and_cost_little);
+    RUN(larger_steps_out_of_pixels_and_into_them_are_seen_at_once);
+    RUN(what_comes_out_of_nothing_is_seen_at_once);
+    RUN(another_camera_or_field_is_a_cold_start);
+    RUN(a_warm_start_needs_its_tape);
+    return test_report();
+}

@@ -541,7 +541,7 @@ static void judge_truth(const scene *s, const planes *p, const scene_field *own)
         if (!x.crosses || x.below < deep || x.t * s->radius - t0 < 2 * rounding) continue;
         if (p->status[i] == DIST_RAY_MISS) {
             misses_judged++;
-            if (s->how.certified || x.below > 5e-3)
+            if (s->how.certified)
                 note(FALSE_MISS, "deep, at", x.below, x.t);
             else
                 shallow_misses++;

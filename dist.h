@@ -783,8 +783,6 @@ extern "C" {
 #endif
 #if defined(__GNUC__) || defined(__clang__)
 #define DISTI_INLINE static inline __attribute__((always_inline))
-#elif defined(_MSC_VER)
-#define DISTI_INLINE static __forceinline
 #else
 #define DISTI_INLINE static inline
 #endif
@@ -2943,7 +2941,8 @@ DIST_API dist_status dist_color_backward(dist_context *ctx, const dist_field *fi
     memset(total, 0, size * sizeof(double));
     disti_color_backward_all(ctx, field, n, points, d_color, d_points, grads, total);
     for (size_t j = 0; grads->code && j < code; j++) disti_add_gradient(&grads->code[j], total[j]);
-    for (size_t j = code; grads->color_code && j < size; j++) disti_add_gradient(&grads->color_code[j - code], total[j]);
+    for (size_t j = code; grads->color_code && j < size; j++)
+        disti_add_gradient(&grads->color_code[j - code], total[j]);
     return DIST_OK;
 }
 
@@ -7166,7 +7165,8 @@ static int disti_ray_bracketed(const disti_tracer *tracer, disti_ray *ray, float
     if (slope > 1e-3f && magnitude <= tolerance * DISTI_MIN(0.5f * slope, flatter)) {
         ray->slope = -slope;
         float width = ray->b - ray->a, off = magnitude + tracer->noise;
-        return disti_ray_end(ray, DIST_RAY_HIT, ray->q + f / slope, 0.0f, off < width * flatter ? off / flatter : width);
+        return disti_ray_end(ray, DIST_RAY_HIT, ray->q + f / slope, 0.0f,
+                             off < width * flatter ? off / flatter : width);
     }
     if (inside) {
         ray->b = ray->q;
@@ -10300,7 +10300,8 @@ DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *ta
     if (job.geometry || grads->color_code || grads->color_weights) disti_backward_pixels(&job);
     disti_float_state_leave(state);
     for (size_t j = 0; grads->code && j < code; j++) disti_add_gradient(&grads->code[j], job.total[j]);
-    for (size_t j = code; grads->color_code && j < size; j++) disti_add_gradient(&grads->color_code[j - code], job.total[j]);
+    for (size_t j = code; grads->color_code && j < size; j++)
+        disti_add_gradient(&grads->color_code[j - code], job.total[j]);
     for (int i = 0; i < 3; i++) {
         if (grads->rotation) disti_add_gradient(&grads->rotation[i], job.rotation[i]);
         if (grads->translation) disti_add_gradient(&grads->translation[i], job.translation[i]);

@@ -121,8 +121,9 @@ static void bench_need(const char *model, int code, int size, int repeats, const
         seconds[i] = seconds_now() - begin;
         check(ctx);
     }
-    printf("%s,%d,%llu,%llu,%llu,%.4g,%.4g,%.4f,%.0f\n", n->name, size, stats.rays, stats.queries, stats.backward_points,
-           stats.operations, stats.operations_done, median((size_t)repeats, seconds), (double)(memory.live - weights));
+    printf("%s,%d,%llu,%llu,%llu,%.4g,%.4g,%.4f,%.0f\n", n->name, size, stats.rays, stats.queries,
+           stats.backward_points, stats.operations, stats.operations_done, median((size_t)repeats, seconds),
+           (double)(memory.live - weights));
     fflush(stdout);
     dist_tape_destroy(tape);
     dist_scene_destroy(scene);

@@ -608,8 +608,8 @@ static void run_scene(sweep *w, const scene *s, int only_size, int most)
 
 /* What a picture is judged by, and what does not matter of it. */
 enum { P99, NORMAL, SILHOUETTE, HOLES, FALSE_HITS, METRICS };
-static const char *const metric_names[METRICS] = {"p99 error", "p99 of the normals' degrees", "silhouette error", "holes",
-                                                  "false hits"};
+static const char *const metric_names[METRICS] = {"p99 error", "p99 of the normals' degrees", "silhouette error",
+                                                  "holes", "false hits"};
 static const double metric_floors[METRICS] = {CLEAR, 0.01, 1e-4, 0, 0};
 
 static double metric(const row *r, int k)

@@ -15,8 +15,8 @@ static const char usage[] =
     "  --depth FILE.pfm   what is seen; 0, infinity or above 1e5 where nothing is. Without it the shape's own depth\n"
     "                     image from --eye and --at, which are then the truth and not known to the fit\n"
     "  --mask FILE.pfm    its silhouette, not 0 inside (default: where there is depth)\n"
-    "  --no-mask          use no silhouette\n" VIEW_USAGE
-    "  --off DEGREES,DISTANCE  how far the start is turned and moved away from --eye and --at, in a direction chosen by\n"
+    "  --no-mask          use no silhouette\n" VIEW_USAGE "  --off DEGREES,DISTANCE  how far the start is turned and "
+                                                          "moved away from --eye and --at, in a direction chosen by\n"
     "                     chance (default 15,0.15; 0,0 with --depth)\n"
     "  --trials N         N starts, each with a shape (unless --target is given), 10 to 20 degrees and 0.1 to 0.2\n"
     "                     (unless --off is given) chosen by chance; how many recover the pose is counted\n"
@@ -390,7 +390,8 @@ static void fit_destroy(fit *f)
 
 static record *take_records(const request *asked)
 {
-    return (record *)take((size_t)((asked->restarts + 1) * (asked->fit.iterations + asked->refine + 1)), sizeof(record));
+    return (record *)take((size_t)((asked->restarts + 1) * (asked->fit.iterations + asked->refine + 1)),
+                          sizeof(record));
 }
 
 static int is_good(const record *r)

@@ -75,7 +75,9 @@ static void pool_start(pool *p, int workers)
     pthread_cond_init(&p->begin, NULL);
     pthread_cond_init(&p->end, NULL);
     for (int i = 1; i < workers; i++) {
-        if (pthread_create(&p->threads[i], NULL, pool_thread, p) != 0) { fail("thread %.0f cannot be started", (double)i); }
+        if (pthread_create(&p->threads[i], NULL, pool_thread, p) != 0) {
+            fail("thread %.0f cannot be started", (double)i);
+        }
     }
 }
 

@@ -943,7 +943,7 @@ TEST(silhouette_backward_at_misses_is_the_derivative_at_the_sample)
 }
 TEST(silhouette_backward_at_misses_is_near_the_derivative_of_the_least_value)
 {
-    /* a value 3e-4 off comes of a sample sqrt(2 3e-4 / c) off, and there grad f turns by c times that: curvature c = 10 */
+    /* a value 3e-4 off: a sample sqrt(2 3e-4 / c) off, where grad f has turned by c times that; curvature c = 10 */
     image_check_analytic(SILHOUETTE_MISS, NULL, TORUS, 8e-2);
     image_check_nets(SILHOUETTE_MISS, NULL, 1, 8e-2);
 }

@@ -1068,10 +1068,13 @@ TEST(a_query_budget_is_kept_and_more_of_it_finds_more)
         shape_crossing c;
         memset(&c, 0, sizeof c);
         if (shape_enter(o, d, 1, &t0, &t1)) c = shape_cross(&shape, o, d, t0, t1, 1, 1e-4, 1e-4);
-        expected[i] = c.crosses && c.below > 2e-6 ? (float)c.t : c.crosses || (t1 > t0 && c.least < 1e-4) ? -1.0f : 0.0f;
+        expected[i] = c.crosses && c.below > 2e-6                ? (float)c.t
+                      : c.crosses || (t1 > t0 && c.least < 1e-4) ? -1.0f
+                                                                 : 0.0f;
         crossing += c.crosses;
     }
-    for (int k = 0; k < 7; k++) { /* guarded without and with normals and silhouette, and without helpers; the paper's */
+    for (int k = 0; k < 7;
+         k++) { /* guarded without and with normals and silhouette, and without helpers; the paper's */
         dist_render_desc how = plain_how();
         dist_images out = all_planes(&a);
         int finished = 0;
@@ -1118,8 +1121,10 @@ TEST(a_query_budget_is_kept_and_more_of_it_finds_more)
             if (!CHECK(resolved >= finished))
                 printf("    case %d, budget %g: %d resolved, %d before\n", k, budgets[j], resolved, finished);
             if (test_state.verbose)
-                printf("    case %d, %g a ray: %.2f used, %d of %d hit, %d resolved, %d false, %d off, mean error %.5f\n", k, budgets[j],
-                       (double)a.stats.queries / (W * H), hits, crossing, resolved, false_hits + false_misses, far, sum / crossing);
+                printf(
+                    "    case %d, %g a ray: %.2f used, %d of %d hit, %d resolved, %d false, %d off, mean error %.5f\n",
+                    k, budgets[j], (double)a.stats.queries / (W * H), hits, crossing, resolved,
+                    false_hits + false_misses, far, sum / crossing);
             CHECK(sum <= 1.001 * before + 1e-3 * crossing);
             finished = resolved;
             before = sum;

@@ -111,7 +111,8 @@ static double second_run(const model *m, const double *params, const double *cod
         int skip = l > 0 && model_sees_input(m, l), out = m->out[l], before = l == 0 || (skip && d->skip_input_first);
         double scale = skip && d->skip_scale > 0.0 ? d->skip_scale : 1.0;
         y->n = 0;
-        for (int k = 0; k < size && before; k++, y->n++) y->x[y->n] = scale * input[k], y->xt[y->n] = scale * input_t[k];
+        for (int k = 0; k < size && before; k++, y->n++)
+            y->x[y->n] = scale * input[k], y->xt[y->n] = scale * input_t[k];
         for (int k = 0; l > 0 && k < m->out[l - 1]; k++, y->n++) y->x[y->n] = scale * a[k], y->xt[y->n] = scale * t[k];
         for (int k = 0; k < size && skip && !before; k++, y->n++)
             y->x[y->n] = scale * input[k], y->xt[y->n] = scale * input_t[k];
@@ -302,7 +303,8 @@ TEST(second_derivatives_in_double_match_central_differences)
             memset(g.params, 0, k.m.count * sizeof(double));
             s = second_run(&k.m, k.m.params, k.code, p, u, &g, &f);
             model_gradient(&k.m, k.m.params, k.code, p, gradient);
-            first = fmax(first, fabs(s - gradient[0] * u[0] - gradient[1] * u[1] - gradient[2] * u[2]) / (1.0 + fabs(s)));
+            first =
+                fmax(first, fabs(s - gradient[0] * u[0] - gradient[1] * u[1] - gradient[2] * u[2]) / (1.0 + fabs(s)));
             first = fmax(first, fabs(f - model_eval(&k.m, k.m.params, k.code, p)));
             int numbers = 3 + desc->code_size + 24;
             for (int a = 0; a < numbers; a++) {
@@ -378,7 +380,8 @@ static void plain_sgemm(void *user, int transpose_a, int transpose_b, int m, int
         for (int j = 0; j < n; j++) {
             float sum = 0.0f;
             for (int l = 0; l < k; l++)
-                sum += (transpose_a ? a[l * lda + i] : a[i * lda + l]) * (transpose_b ? b[j * ldb + l] : b[l * ldb + j]);
+                sum +=
+                    (transpose_a ? a[l * lda + i] : a[i * lda + l]) * (transpose_b ? b[j * ldb + l] : b[l * ldb + j]);
             c[i * ldc + j] = alpha * sum + (beta == 0.0f ? 0.0f : beta * c[i * ldc + j]);
         }
 }

@@ -283,7 +283,8 @@ TEST_UNUSED static void model_fit_ball(model *m, const double *code, double radi
             for (int k = size; k >= j; k--) a[i][k] -= factor * a[j][k];
         }
     int channel = m->sdf_channel >= 0 ? m->sdf_channel : 0;
-    for (int k = 0; k < n; k++) m->params[m->offset[l] + (size_t)(channel * n + k)] = model_round(MODEL_F32, a[k][size]);
+    for (int k = 0; k < n; k++)
+        m->params[m->offset[l] + (size_t)(channel * n + k)] = model_round(MODEL_F32, a[k][size]);
     m->params[m->offset[l] + (size_t)(m->out[l] * n + channel)] = model_round(MODEL_F32, a[n][size]);
 }
 

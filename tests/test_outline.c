@@ -112,8 +112,8 @@ static dist_tape *outline_backward(dist_context *ctx, const dist_field *field, c
     return tape;
 }
 
-/* Every seed is d_c (c_out - c_in) / band at the sample of smallest f, in double; d_c, here linear over the picture, where
-   the sphere's point next to the sample is seen. Hits give nothing: their color does not change. */
+/* Every seed is d_c (c_out - c_in) / band at the sample of smallest f, in double; d_c, here linear over the picture,
+   where the sphere's point next to the sample is seen. Hits give nothing: their color does not change. */
 TEST(outline_seeds_are_what_the_equation_says)
 {
     for (int paper = 0; paper < 2; paper++) {

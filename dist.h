@@ -2215,11 +2215,11 @@ DISTI_KERNELS(avx512, 8, 3)
 #define DISTI_STORE(p, v) vst1q_f32(p, v)
 #define DISTI_ADD(a, b) vaddq_f32(a, b)
 #define DISTI_FMA(a, b, c) vfmaq_f32(c, a, b)
-#define DISTI_RELU(v) disti_relu_neon(v)
+#define DISTI_RELU(v) disti_positive_part(v)
 #define DISTI_POSITIVE(v) disti_positive_neon(v)
 #define DISTI_BITS(row, column, v) *(row) |= (uint64_t)DISTI_POSITIVE(v) << (column);
 #define DISTI_KEEP(v, bits) disti_keep_neon(v, (uint32_t)((bits) & 0xf))
-static float32x4_t disti_relu_neon(float32x4_t v)
+static float32x4_t disti_positive_part(float32x4_t v)
 {
     const uint32x4_t positive = vcgtq_f32(v, vdupq_n_f32(0.0f));
     return vreinterpretq_f32_u32(vandq_u32(vreinterpretq_u32_f32(v), positive));
@@ -7498,7 +7498,11 @@ typedef struct disti_budget {
 } disti_budget;
 
 /* Where the cones' axes over a block of 8 x 8 pixels had the least f: distance from the camera, f (3e38: no sample). */
-enum { DISTI_LEAST_BLOCK = 8, DISTI_LEASTS = (DISTI_TILE / DISTI_LEAST_BLOCK) * (DISTI_TILE / DISTI_LEAST_BLOCK) };
+enum {
+    DISTI_LEAST_BLOCK = 8,
+    DISTI_LEAST_ROW = (int)DISTI_TILE / DISTI_LEAST_BLOCK,
+    DISTI_LEASTS = DISTI_LEAST_ROW * DISTI_LEAST_ROW
+};
 typedef struct disti_least {
     float t[DISTI_LEASTS], f[DISTI_LEASTS];
 } disti_least;
@@ -8110,7 +8114,7 @@ static void disti_cone_finish(const disti_tracer *tracer, const disti_tile *tile
 {
     for (int y = cone->y; y < DISTI_MIN(cone->y + cone->size, tile->own_height); y += DISTI_LEAST_BLOCK) {
         for (int x = cone->x; x < DISTI_MIN(cone->x + cone->size, tile->own_width); x += DISTI_LEAST_BLOCK) {
-            int block = y / DISTI_LEAST_BLOCK * (DISTI_TILE / DISTI_LEAST_BLOCK) + x / DISTI_LEAST_BLOCK;
+            int block = y / DISTI_LEAST_BLOCK * DISTI_LEAST_ROW + x / DISTI_LEAST_BLOCK;
             if (!(cone->least_f < bench->least_of->f[block])) continue;
             bench->least_of->f[block] = cone->least_f;
             bench->least_of->t[block] = (float)cone->least_t;
@@ -8507,7 +8511,7 @@ static void disti_silhouette(const disti_tracer *tracer, int worker, const disti
         for (int i = 0; i < n; i++) {
             disti_ray *ray = &bench->rays[i];
             int x = i % w, y = i / w, agree = 0, up = h == 1 ? (int)DISTI_NODE : 2 * h; /* nodes known, up apart */
-            int block = y / DISTI_LEAST_BLOCK * (DISTI_TILE / DISTI_LEAST_BLOCK) + x / DISTI_LEAST_BLOCK;
+            int block = y / DISTI_LEAST_BLOCK * DISTI_LEAST_ROW + x / DISTI_LEAST_BLOCK;
             float t = bench->least_of->t[block], f = bench->least_of->f[block];
             if (!disti_wants_minimum(ray) || !disti_silhouette_node(tile, x, y, h)) continue;
             if (h < 2 * DISTI_NODE) {
@@ -8747,7 +8751,7 @@ static void disti_paper_trace(const disti_tracer *tracer, int worker, const dist
 
 /*@ 08 render ------------------------------------------------------------------------------------------------------- */
 
-enum { DISTI_RUN = DISTI_SLOTS * DISTI_BLOCK }; /* pixels whose colors and normals go back at once */
+enum { DISTI_RUN = (int)DISTI_SLOTS * DISTI_BLOCK }; /* pixels whose colors and normals go back at once */
 
 /* One point of the backward pass. */
 typedef struct disti_entry {
@@ -9080,16 +9084,16 @@ static void disti_render_pixel(const disti_render_job *job, const disti_ray *ray
     if (!job->tape) return;
     int sampled = ray->enter < ray->leave && ray->fbest < 2e38f && ray->status != DIST_RAY_NOT_FINITE;
     job->tape->s[pixel] = ray->best;
-    if (!job->tape->value) return;
-    job->tape->start[pixel] = ray->kept ? DISTI_MIN(job->tape->start[pixel], ray->stop) : ray->stop;
-    /* a ray that was looking for the way out has no slope to start from */
-    job->tape->value[pixel] = ray->status != DIST_RAY_HIT ? ray->fbest : ray->sign > 0.0f ? ray->slope : 0.0f;
     job->tape->status[pixel] = (unsigned char)(ray->status | (ray->status == DIST_RAY_HIT ? DISTI_TAPE_HIT : 0) |
                                                (sampled ? DISTI_TAPE_SAMPLE : 0) |
                                                (sampled && ray->status == DIST_RAY_MISS && ray->fbest > 0.0f &&
                                                         ray->fbest < job->tracer->how.relax_band
                                                     ? DISTI_TAPE_NEAR
                                                     : 0));
+    if (!job->tape->value) return;
+    job->tape->start[pixel] = ray->kept ? DISTI_MIN(job->tape->start[pixel], ray->stop) : ray->stop;
+    /* a ray that was looking for the way out has no slope to start from */
+    job->tape->value[pixel] = ray->status != DIST_RAY_HIT ? ray->fbest : ray->sign > 0.0f ? ray->slope : 0.0f;
 }
 
 static void disti_render_planes(const disti_render_job *job, const disti_tile *tile, const disti_bench *bench)
@@ -9408,7 +9412,7 @@ static void disti_warm_misses(disti_warm *warm)
         disti_ray *ray = &bench->rays[i];
         unsigned x = (unsigned)(i % warm->tile->width), y = (unsigned)(i / warm->tile->width);
         int blocked = warm->open[i] && ray->mode != DISTI_DONE;
-        if (warm->tape->status[pixel] != (DIST_RAY_MISS | DISTI_TAPE_SAMPLE)) continue;
+        if (warm->tape->status[pixel] != ((int)DIST_RAY_MISS | DISTI_TAPE_SAMPLE)) continue;
         if (!blocked && (warm->open[i] || ray->status != DIST_RAY_MISS || !(ray->enter < ray->leave))) continue;
         float f = warm->tape->value[pixel], loss = 1.5f * warm->change;
         /* the cones went through here: nothing is known of a ray that they do not clear any more */
@@ -9585,7 +9589,7 @@ static void disti_nearest_task(void *arg, int index, int worker)
             size_t pixel = (size_t)y * (size_t)tape->width + (size_t)x;
             float s = tape->s[pixel], nearest = 3e38f;
             int hit = tape->status[pixel] & DISTI_TAPE_HIT,
-                none = tape->status[pixel] != (DIST_RAY_MISS | DISTI_TAPE_SAMPLE);
+                none = tape->status[pixel] != ((int)DIST_RAY_MISS | DISTI_TAPE_SAMPLE);
             float closest = 3e38f;
             for (int k = 0; k < 8 && (hit || !none); k++) {
                 int side = k & 1 ? -1 : 1, ox = dx[k / 2] * side, oy = dy[k / 2] * side;

@@ -314,7 +314,7 @@ static void sphere_photos(sphere_pair *s, const float *numbers)
             if (s->mask[v][i]) paint(p, s->color[v] + 3 * i);
         }
     }
-    for (int i = 3 * SPHERE_SIDE; i < SPHERE_PIXELS - 3 * SPHERE_SIDE; i++) {
+    for (int i = 3 * SPHERE_SIDE + 3; i < SPHERE_PIXELS - 3 * SPHERE_SIDE - 3; i++) {
         s->inner[i] = 1;
         for (int k = 0; k < 49; k++) s->inner[i] &= s->mask[0][i + (k / 7 - 3) * SPHERE_SIDE + k % 7 - 3];
     }

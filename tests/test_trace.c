@@ -240,6 +240,51 @@ TEST(no_rod_thinner_than_a_pixel_is_missed)
     dist_context_destroy(ctx);
 }
 
+/* how.certified takes no step on trust, so what the slopes' bounds allow is all found: hits as in double, none missed. */
+TEST(certified_rays_miss_nothing)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(side(), side());
+    dist_render_desc how;
+    memset(&how, 0, sizeof how);
+    how.certified = 1;
+    test_shape shapes[3];
+    shapes[0] = shape_make(SHAPE_RODS, 2e-3, 0, 0, 0);
+    shapes[1] = shape_make(SHAPE_BOX, 0.6, 0.5, 5e-4, 0);
+    shapes[2] = shape_make(SHAPE_BOX, 0.05, 0.04, 0.06, 0);
+    for (int k = 0; k < 3; k++) {
+        dist_field field = shape_field(&shapes[k], 1, 1);
+        CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, &how, &picture_a), ctx);
+        verdict v = judge(&shapes[k], &camera, 1, 1, 1e-5, &picture_a);
+        CHECK_EQUAL(0, v.missed);
+        CHECK_EQUAL(0, v.phantom);
+        CHECK(v.crossing > 0);
+    }
+    dist_context_destroy(ctx);
+}
+
+/* The far figure bounds slopes where f is large: a looser one costs queries and loses nothing; bad ones are refused. */
+TEST(lipschitz_far_holds_where_f_is_large)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(side(), side());
+    dist_render_desc how;
+    memset(&how, 0, sizeof how);
+    how.certified = 1;
+    test_shape shape = shape_make(SHAPE_BOX, 0.6, 0.5, 5e-4, 0);
+    dist_field field = shape_field(&shape, 1, 1), plain = field;
+    field.lipschitz_far = 2.0f; /* a looser bound: the same picture at more queries */
+    CHECK_STATUS(DIST_OK, picture_render(ctx, &plain, &camera, &how, &picture_a), ctx);
+    CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, &how, &picture_b), ctx);
+    CHECK(picture_b.stats.queries > picture_a.stats.queries);
+    CHECK_EQUAL(0, judge(&shape, &camera, 1, 1, 1e-5, &picture_b).missed);
+    field.lipschitz_far = -1.0f;
+    CHECK_EQUAL(DIST_BAD_ARGUMENT, picture_render(ctx, &field, &camera, &how, &picture_b));
+    how.certified = 2;
+    CHECK_EQUAL(DIST_BAD_ARGUMENT, picture_render(ctx, &plain, &camera, &how, &picture_b));
+    dist_context_destroy(ctx);
+}
+
 TEST(cones_change_no_pixel)
 {
     dist_context *ctx = shape_context();
@@ -1102,6 +1147,8 @@ int main(int argc, char **argv)
     RUN(no_plate_however_thin_is_missed);
     RUN(no_plate_is_missed_silently_at_any_angle);
     RUN(no_rod_thinner_than_a_pixel_is_missed);
+    RUN(certified_rays_miss_nothing);
+    RUN(lipschitz_far_holds_where_f_is_large);
     RUN(cones_change_no_pixel);
     RUN(grazing_rays_hit_within_the_bound_or_say_that_they_are_unresolved);
     RUN(twelve_queries_finish_98_of_100_rays_once_they_have_crossed);

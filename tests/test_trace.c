@@ -240,7 +240,7 @@ TEST(no_rod_thinner_than_a_pixel_is_missed)
     dist_context_destroy(ctx);
 }
 
-/* how.certified takes no step on trust: what the bounds on slopes allow is all found, hits as in double, none missed. */
+/* how.certified takes no step on trust: what the bounds on slopes allow is all found, none missed. */
 TEST(certified_rays_miss_nothing)
 {
     dist_context *ctx = shape_context();

@@ -23,6 +23,7 @@ static const char usage[] =
     "  --color-code N     which of the texture's colorings (default 0)\n"
     "  --views N          photos taken (default 24)\n"
     "  --size WxH         of each (default 112x112)\n"
+    "  --fov DEGREES      of each, from top to bottom (default 45)\n"
     "  --background WHICH sky (default, a pattern far away) or plain\n"
     "  --batch N          photos a step (default 8)\n"
     "  --start WHICH      random:SEED (default random:1), zero, mean, INDEX or FILE: the code to begin with\n"
@@ -46,7 +47,7 @@ enum { GRADIENT_MESH = 4, NEIGHBORS = 2, SHOWN = 4, SCORE_POINTS = 10000 };
 typedef struct request {
     const char *model, *target, *texture, *photos, *save, *start, *out;
     int width, height, views, batch, iterations, trials, plain, gradient, cells, color_code, similarity;
-    float rate, weights[2], ssim, blur, off[3], place[4];
+    float rate, weights[2], ssim, blur, off[3], place[4], fov;
     dist_context_desc settings;
 } request;
 
@@ -173,7 +174,7 @@ static void take_photos(fit *f, const dist_field *field)
         look.eye[0] = 2.4f * cosf(rise);
         look.eye[1] = 2.4f * sinf(rise);
         look.eye[2] = 0.0f;
-        look.fov = 45.0f;
+        look.fov = o->fov;
         f->views[i].camera = view_camera(&look, turn);
         view_take(f, &f->views[i]);
         take_photo(f, field, &f->views[i]);
@@ -674,6 +675,7 @@ static request read_options(int argc, char **argv)
     r.weights[0] = 5.0f;
     r.weights[1] = 1.0f;
     r.blur = 4.0f;
+    r.fov = 45.0f;
     r.cells = 48;
     r.off[0] = r.off[1] = 10.0f;
     r.off[2] = 0.1f;
@@ -702,6 +704,8 @@ static request read_options(int argc, char **argv)
             r.views = option_int(&walk, 2, 1000);
         } else if (option_is(&walk, "--size")) {
             option_size(&walk, &r.width, &r.height);
+        } else if (option_is(&walk, "--fov")) {
+            r.fov = (float)option_number(&walk, 0.1, 175.0);
         } else if (option_is(&walk, "--background")) {
             r.plain = option_choice(&walk, backgrounds);
         } else if (option_is(&walk, "--batch")) {

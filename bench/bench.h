@@ -1,7 +1,14 @@
 /* SPDX-License-Identifier: MIT-0
-   bench.h - what the benchmarks share: test data, medians. Include it after common.h. */
+   bench.h - what the benchmarks share: test data, medians, what results belong to. Include it after common.h. */
 #ifndef DIST_BENCH_BENCH_H
 #define DIST_BENCH_BENCH_H
+
+/* Machine and commit that plots are marked with: what `sh bench/machine.sh` prints, by DIST_ORIGIN. */
+static inline const char *bench_origin(void)
+{
+    const char *origin = getenv("DIST_ORIGIN");
+    return origin && origin[0] ? origin : "dist.h, run by hand: machine and commit not noted";
+}
 
 /* A network of the test data, which is not part of the repository: in DIST_DATA, or ../shared/data. */
 static inline const char *net_path(char path[PATH_SIZE], const char *name)
@@ -38,8 +45,7 @@ static inline dist_net *load_net_or_skip(dist_context *ctx, const char *name)
     return load_model(ctx, path);
 }
 
-/* 2.2 radii away, azimuth 35, elevation 25 degrees,
-    a focal length of 385 pixels at 512 (of the shorter side): then about
+/* 2.2 radii away, azimuth 35, elevation 25 degrees, a focal length of 385 pixels at 512 (of the shorter side): then about
    121,000 rays of 512 x 512 meet the bounding sphere, as in the paper's table of queries. */
 static inline dist_camera bench_camera(const dist_field *field, int width, int height)
 {

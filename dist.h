@@ -574,6 +574,26 @@ DIST_API void dist_tape_destroy(dist_tape *tape);
 DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, const dist_camera *camera,
                                  const dist_render_desc *desc, const dist_images *out, dist_tape *tape);
 
+/* What is to be made, in this order. Zero or NULL: not this. */
+typedef struct dist_workspace_desc {
+    const dist_context_desc *context; /* dist_context_create; NULL: its defaults */
+    const void *model, *texture;      /* dist_net_load of these bytes, for the shapes and for their texture */
+    size_t model_size, texture_size;
+    const dist_net *net, *texture_net; /* instead: nets that are there already, loaded elsewhere */
+    int shapes;    /* dist_shape_create as often, each with dist_shape_set_texture; 0: once, where there is a net */
+    int instances; /* dist_scene_create of so many of these shapes */
+    const dist_camera *camera; /* dist_tape_create for it and how. The size of a picture without a tape, its planes and
+                                  what of it is wanted cost no memory */
+    const dist_render_desc *how;
+} dist_workspace_desc;
+/* The bytes that an arena needs which hands out one piece after another, from an address that is a multiple of 64 and
+   each rounded up to one, and takes nothing back: exactly; with one less some create function fails with
+   DIST_OUT_OF_MEMORY. The create functions' own code is run without memory. dist_net_load_file needs its file's bytes
+   besides, meshes and Chamfer distance theirs.
+   0: a create function would refuse; desc->context->logger is told why. The table of contents of a model is read into
+   memory of desc->context->allocator, or malloc's, and given back. */
+DIST_API size_t dist_workspace_bytes(const dist_workspace_desc *desc);
+
 #ifndef DIST_NO_BACKWARD
 /* Adjoint of the dist_render that filled the tape: reads d_out's depth, distance, normal, silhouette, color; adds to
    grads; with how.relax_band color also at misses: outlines move, though not those that lie before another surface.
@@ -905,17 +925,17 @@ struct dist_context {
     int isa;
     dist_status status;
     char message[400];
-    unsigned char *scratch; /* workers * scratch_bytes; grown by create functions only */
-    size_t scratch_bytes;   /* of each worker, a multiple of DISTI_ALIGNMENT */
+    unsigned char *scratch; /* workers * DISTI_SCRATCH_BYTES: counters, then the tracer's part */
+    unsigned char *lanes;   /* workers * lane_bytes: the field's part; grown by create functions only */
+    size_t lane_bytes;      /* of each worker, a multiple of DISTI_ALIGNMENT */
     double *partial;        /* DISTI_SLOTS * partial_size: sums of each slot, added in slot order */
     size_t partial_size;
 };
 
-/* Each worker's scratch: counters, then the tracer's part, then the field's. */
 enum {
     DISTI_COUNTER_BYTES = 64,
     DISTI_TRACE_BYTES = 1280 * 1024,
-    DISTI_FIELD_OFFSET = DISTI_COUNTER_BYTES + DISTI_TRACE_BYTES
+    DISTI_SCRATCH_BYTES = DISTI_COUNTER_BYTES + DISTI_TRACE_BYTES
 };
 /* Sums that must not depend on the number of threads are kept in this many slots. */
 enum { DISTI_SLOTS = 32 };
@@ -1200,25 +1220,30 @@ static dist_status disti_enter(const dist_context *ctx, const char *function)
     return ctx->workers > 0 ? DIST_OK : ctx->status;
 }
 
-/* Makes each worker's scratch at least `bytes`. The contents do not survive: create functions only. */
-static dist_status disti_scratch_reserve(dist_context *ctx, size_t bytes)
+/* Makes each worker's lane at least `bytes`. The contents do not survive: create functions only. */
+static dist_status disti_lanes_reserve(dist_context *ctx, size_t bytes)
 {
     size_t each, total;
-    if (bytes <= ctx->scratch_bytes) return DIST_OK;
+    if (bytes <= ctx->lane_bytes) return DIST_OK;
     disti_size_add(bytes, DISTI_ALIGNMENT - 1, &each);
     each &= ~(size_t)(DISTI_ALIGNMENT - 1);
     if (!disti_size_mul(each, (size_t)ctx->workers, &total)) total = (size_t)-1;
-    unsigned char *scratch = (unsigned char *)disti_alloc(ctx, total);
-    if (!scratch) return DIST_OUT_OF_MEMORY;
-    disti_free(ctx, ctx->scratch, ctx->scratch_bytes * (size_t)ctx->workers);
-    ctx->scratch = scratch;
-    ctx->scratch_bytes = each;
+    unsigned char *lanes = (unsigned char *)disti_alloc(ctx, total);
+    if (!lanes) return DIST_OUT_OF_MEMORY;
+    disti_free(ctx, ctx->lanes, ctx->lane_bytes * (size_t)ctx->workers);
+    ctx->lanes = lanes;
+    ctx->lane_bytes = each;
     return DIST_OK;
 }
 
 static unsigned char *disti_scratch(const dist_context *ctx, int worker)
 {
-    return ctx->scratch + ctx->scratch_bytes * (size_t)worker;
+    return ctx->scratch + (size_t)DISTI_SCRATCH_BYTES * (size_t)worker;
+}
+
+static unsigned char *disti_lane(const dist_context *ctx, int worker)
+{
+    return ctx->lanes + ctx->lane_bytes * (size_t)worker;
 }
 
 /* The next `count` things of `size` bytes in a block of memory; base NULL: only *at moves on. */
@@ -1262,6 +1287,12 @@ static dist_status disti_partial_reserve(dist_context *ctx, size_t size)
     ctx->partial = partial;
     ctx->partial_size = size;
     return DIST_OK;
+}
+
+/* For the sums of a gradient for `codes` numbers, and one more for what a piece leaves over. */
+static dist_status disti_partial_for(dist_context *ctx, size_t codes)
+{
+    return disti_partial_reserve(ctx, codes + codes / DISTI_SLOTS + 1);
 }
 
 /* C (3, 4) = 2 A B + 3 C in all four transpositions, against plain loops; small integers, so every right BLAS is
@@ -1314,48 +1345,63 @@ static dist_status disti_context_check(dist_context *ctx, const dist_context_des
     return DIST_OK;
 }
 
+/* All of dist_context_create but the memory of ctx itself. DIST_OUT_OF_MEMORY: nothing is held; after any other failure
+   the context refuses everything. */
+static dist_status disti_context_begin(dist_context *ctx, const dist_context_desc *desc, const dist_allocator *allocator)
+{
+    memset(ctx, 0, sizeof *ctx);
+    ctx->allocator = *allocator;
+    ctx->logger = desc->logger;
+    dist_status status = disti_context_check(ctx, desc);
+    if (status != DIST_OK) return status;
+    ctx->scheduler = desc->scheduler;
+    ctx->blas = desc->blas;
+    ctx->blas_width = desc->blas_width > 0 ? desc->blas_width : 128;
+    ctx->isa = desc->isa == DIST_ISA_AUTO ? disti_cpu_best() : desc->isa;
+    ctx->workers = desc->workers > 0 ? desc->workers : disti_default_workers();
+#ifndef DISTI_OPENMP
+    if (!ctx->scheduler.run_fn) ctx->workers = 1;
+#endif
+    size_t total;
+    if (!disti_size_mul(DISTI_SCRATCH_BYTES, (size_t)ctx->workers, &total)) total = (size_t)-1;
+    ctx->scratch = (unsigned char *)disti_alloc(ctx, total);
+    return ctx->scratch ? DIST_OK : DIST_OUT_OF_MEMORY;
+}
+
+/* desc's allocator, or malloc's. 0: only half of one, or none and no malloc. */
+static int disti_allocator_of(const dist_context_desc *desc, dist_allocator *allocator)
+{
+    *allocator = desc->allocator;
+    if (!allocator->alloc_fn != !allocator->free_fn) return 0;
+    if (allocator->alloc_fn) return 1;
+#ifdef DIST_NO_LIBC_ALLOC
+    return 0;
+#else
+    allocator->alloc_fn = disti_libc_alloc;
+    allocator->free_fn = disti_libc_free;
+    return 1;
+#endif
+}
+
 DIST_API dist_context *dist_context_create(const dist_context_desc *desc)
 {
     dist_context_desc d;
     dist_allocator allocator;
     memset(&d, 0, sizeof d);
     if (desc) d = *desc;
-    allocator = d.allocator;
-    if (!allocator.alloc_fn != !allocator.free_fn) return NULL;
-    if (!allocator.alloc_fn) {
-#ifdef DIST_NO_LIBC_ALLOC
-        return NULL;
-#else
-        allocator.alloc_fn = disti_libc_alloc;
-        allocator.free_fn = disti_libc_free;
-#endif
-    }
+    if (!disti_allocator_of(&d, &allocator)) return NULL;
     dist_context *ctx = (dist_context *)allocator.alloc_fn(allocator.user, sizeof(dist_context), DISTI_ALIGNMENT);
-    if (!ctx) return NULL;
-    memset(ctx, 0, sizeof *ctx);
-    ctx->allocator = allocator;
-    ctx->logger = d.logger;
-    if (disti_context_check(ctx, &d) != DIST_OK) return ctx;
-    ctx->scheduler = d.scheduler;
-    ctx->blas = d.blas;
-    ctx->blas_width = d.blas_width > 0 ? d.blas_width : 128;
-    ctx->isa = d.isa == DIST_ISA_AUTO ? disti_cpu_best() : d.isa;
-    ctx->workers = d.workers > 0 ? d.workers : disti_default_workers();
-#ifndef DISTI_OPENMP
-    if (!ctx->scheduler.run_fn) ctx->workers = 1;
-#endif
-    if (disti_scratch_reserve(ctx, DISTI_FIELD_OFFSET) != DIST_OK) {
-        disti_free(ctx, ctx, sizeof *ctx);
-        return NULL;
-    }
-    return ctx;
+    if (!ctx || disti_context_begin(ctx, &d, &allocator) != DIST_OUT_OF_MEMORY) return ctx;
+    disti_free(ctx, ctx, sizeof *ctx);
+    return NULL;
 }
 
 DIST_API void dist_context_destroy(dist_context *ctx)
 {
     if (!ctx) return;
     disti_free(ctx, ctx->partial, ctx->partial_size * DISTI_SLOTS * sizeof(double));
-    disti_free(ctx, ctx->scratch, ctx->scratch_bytes * (size_t)ctx->workers);
+    disti_free(ctx, ctx->lanes, ctx->lane_bytes * (size_t)ctx->workers);
+    disti_free(ctx, ctx->scratch, (size_t)DISTI_SCRATCH_BYTES * (size_t)ctx->workers);
     disti_free(ctx, ctx, sizeof *ctx);
 }
 
@@ -2935,7 +2981,7 @@ DIST_API dist_status dist_color_backward(dist_context *ctx, const dist_field *fi
     if (!points || !d_color)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: %s is NULL", points ? "d_color" : "points", 0, 0);
     size_t code = (size_t)field->code_size, size = code + (size_t)field->color_code_size;
-    status = disti_partial_reserve(ctx, size + size / DISTI_SLOTS + 1);
+    status = disti_partial_for(ctx, size);
     if (status != DIST_OK) return status;
     double *total = ctx->partial + (size_t)DISTI_SLOTS * size;
     memset(total, 0, size * sizeof(double));
@@ -2951,7 +2997,7 @@ static dist_status disti_code_begin(dist_context *ctx, const dist_field *field, 
                                     double **d_code)
 {
     size_t size = (size_t)field->code_size;
-    dist_status status = disti_partial_reserve(ctx, size + size / DISTI_SLOTS + 1);
+    dist_status status = disti_partial_for(ctx, size);
     *d_code = status == DIST_OK && grads->code ? ctx->partial + (size_t)DISTI_SLOTS * size : NULL;
     if (*d_code) memset(*d_code, 0, size * sizeof(double));
     return status;
@@ -3592,11 +3638,23 @@ DIST_API void dist_scene_destroy(dist_scene *scene)
     disti_free(scene->ctx, scene, sizeof *scene);
 }
 
+/* The memory of a scene whose ctx and count are set, but for its own and its codes'. */
+static dist_status disti_scene_take(dist_scene *scene)
+{
+    dist_context *ctx = scene->ctx;
+    disti_scene_work w;
+    size_t lanes, count = (size_t)scene->count;
+    scene->scratch_bytes = disti_scene_layout(scene, NULL, &w);
+    if (!disti_size_mul(scene->scratch_bytes, (size_t)ctx->workers, &lanes)) lanes = (size_t)-1;
+    scene->placed = (disti_placed *)disti_alloc(ctx, count * sizeof(disti_placed));
+    scene->ball = scene->placed ? (disti_ball *)disti_alloc(ctx, count * sizeof(disti_ball)) : NULL;
+    scene->scratch = scene->ball ? (unsigned char *)disti_alloc(ctx, lanes) : NULL;
+    return scene->scratch ? DIST_OK : DIST_OUT_OF_MEMORY;
+}
+
 DIST_API dist_scene *dist_scene_create(dist_context *ctx, int count, const dist_instance *instances)
 {
     const char *name = "dist_scene_create";
-    disti_scene_work w;
-    size_t lanes, codes;
     if (disti_enter(ctx, name) != DIST_OK) return NULL;
     if (count < 1 || count > 1 << 20 || !instances) {
         disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: count is %d, must be 1 to 2^20; instances not NULL", name, count, 0);
@@ -3607,13 +3665,8 @@ DIST_API dist_scene *dist_scene_create(dist_context *ctx, int count, const dist_
     memset(scene, 0, sizeof *scene);
     scene->ctx = ctx;
     scene->count = count;
-    scene->scratch_bytes = disti_scene_layout(scene, NULL, &w);
-    if (!disti_size_mul(scene->scratch_bytes, (size_t)ctx->workers, &lanes)) lanes = (size_t)-1;
-    scene->placed = (disti_placed *)disti_alloc(ctx, (size_t)count * sizeof(disti_placed));
-    scene->ball = scene->placed ? (disti_ball *)disti_alloc(ctx, (size_t)count * sizeof(disti_ball)) : NULL;
-    scene->scratch = scene->ball ? (unsigned char *)disti_alloc(ctx, lanes) : NULL;
-    if (!scene->scratch) goto fail;
-    memset(scene->scratch, 0, lanes);
+    if (disti_scene_take(scene) != DIST_OK) goto fail;
+    memset(scene->scratch, 0, scene->scratch_bytes * (size_t)ctx->workers);
     memset(scene->placed, 0, (size_t)count * sizeof(disti_placed));
     for (int k = 0; k < count; k++) {
         disti_placed *placed = &scene->placed[k];
@@ -3628,9 +3681,7 @@ DIST_API dist_scene *dist_scene_create(dist_context *ctx, int count, const dist_
             goto fail;
         }
     }
-    codes = scene->code_size + scene->color_code_size;
-    if (disti_partial_reserve(ctx, codes + codes / DISTI_SLOTS + 1) != DIST_OK) goto fail;
-    return scene;
+    if (disti_partial_for(ctx, scene->code_size + scene->color_code_size) == DIST_OK) return scene;
 fail:
     dist_scene_destroy(scene);
     return NULL;
@@ -5118,7 +5169,7 @@ static void disti_net_reverse(const dist_shape *shape, disti_block *b, const flo
 /* Loads up to B points into the block and makes its worker's memory ready. */
 static void disti_block_begin(const dist_shape *shape, int worker, disti_block *b, size_t n, const float *points)
 {
-    disti_block_layout(shape->net, disti_scratch(shape->ctx, worker) + DISTI_FIELD_OFFSET, b);
+    disti_block_layout(shape->net, disti_lane(shape->ctx, worker), b);
     b->columns = (int)n;
     b->channel = shape->net->sdf_channel;
     b->channels = 1;
@@ -5173,7 +5224,7 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
     const dist_shape *shape = (const dist_shape *)user;
     const dist_net *net = shape->net;
     disti_block b;
-    disti_block_layout(net, disti_scratch(shape->ctx, worker) + DISTI_FIELD_OFFSET, &b);
+    disti_block_layout(net, disti_lane(shape->ctx, worker), &b);
     if (d_code) memset(b.fold_sum, 0, (size_t)net->fold_count * (size_t)net->max_rows * sizeof(double));
     for (size_t at = 0; at < n; at += DISTI_BLOCK) {
         size_t count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK);
@@ -5250,7 +5301,7 @@ static void disti_shape_second(void *user, int worker, size_t n, const float *po
     const dist_shape *shape = (const dist_shape *)user;
     const dist_net *net = shape->net;
     disti_block b;
-    disti_block_layout(net, disti_scratch(shape->ctx, worker) + DISTI_FIELD_OFFSET, &b);
+    disti_block_layout(net, disti_lane(shape->ctx, worker), &b);
     if (d_code) memset(b.fold_sum, 0, (size_t)net->fold_count * (size_t)net->max_rows * sizeof(double));
     for (size_t at = 0; at < n; at += DISTI_BLOCK / 2) {
         size_t count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK / 2);
@@ -5313,7 +5364,7 @@ static void disti_wide_eval(const dist_shape *shape, int worker, size_t n, const
     disti_kernels kernels = disti_kernels_for(shape->ctx->isa);
     disti_block b;
     size_t bytes = disti_block_layout(net, NULL, &b), stride = DISTI_WIDE_COLUMNS;
-    float *point = (float *)(void *)(disti_scratch(shape->ctx, worker) + DISTI_FIELD_OFFSET + bytes);
+    float *point = (float *)(void *)(disti_lane(shape->ctx, worker) + bytes);
     float *wide[2];
     wide[0] = point + (size_t)net->point_size * stride;
     wide[1] = wide[0] + (size_t)net->max_rows * stride;
@@ -5405,7 +5456,7 @@ static void disti_shape_color_adjoint_fn(void *user, int worker, size_t n, const
     const dist_net *net = paint->net;
     size_t own = (size_t)((const dist_shape *)user)->net->code_size;
     disti_block b;
-    disti_block_layout(net, disti_scratch(paint->ctx, worker) + DISTI_FIELD_OFFSET, &b);
+    disti_block_layout(net, disti_lane(paint->ctx, worker), &b);
     memset(b.fold_sum, 0, (size_t)net->fold_count * (size_t)net->max_rows * sizeof(double));
     for (size_t at = 0; at < n; at += DISTI_BLOCK) {
         size_t count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK);
@@ -5693,7 +5744,7 @@ static void disti_shape_slope(dist_shape *shape, const dist_field *field)
         unsigned state = disti_float_state_enter();
         field->eval_fn(shape, 0, DISTI_BLOCK, points, sdf, gradient);
         disti_float_state_leave(state);
-        disti_block_layout(net, disti_scratch(shape->ctx, 0) + DISTI_FIELD_OFFSET, &b);
+        disti_block_layout(net, disti_lane(shape->ctx, 0), &b);
         for (int l = 1; l < net->layers; l++)
             for (int k = 0; k < net->layer[l].prev; k++)
                 if (!b.mask[(size_t)l * (size_t)net->max_rows + (size_t)k]) shape->all_alive &= ~((uint32_t)1 << l);
@@ -5822,28 +5873,19 @@ DIST_API void dist_shape_destroy(dist_shape *shape)
     disti_free(ctx, shape, sizeof *shape);
 }
 
-DIST_API dist_shape *dist_shape_create(dist_context *ctx, const dist_net *net, const float *code)
+/* The memory of a shape whose ctx and net are set, but for its own. */
+static dist_status disti_shape_take(dist_shape *shape)
 {
+    dist_context *ctx = shape->ctx;
+    const dist_net *net = shape->net;
     disti_block b;
-    if (disti_enter(ctx, "dist_shape_create") != DIST_OK) return NULL;
-    if (!net) {
-        disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_shape_create: net is NULL", NULL, 0, 0);
-        return NULL;
-    }
-    if (disti_scratch_reserve(ctx, DISTI_FIELD_OFFSET + disti_block_layout(net, NULL, &b) +
-                                       disti_wide_floats(ctx, net) * sizeof(float)) != DIST_OK)
-        return NULL;
-    if (disti_partial_reserve(ctx, (size_t)net->code_size + (size_t)net->code_size / DISTI_SLOTS + 1) != DIST_OK)
-        return NULL;
-    dist_shape *shape = (dist_shape *)disti_alloc(ctx, sizeof(dist_shape));
-    if (!shape) return NULL;
-    memset(shape, 0, sizeof *shape);
-    shape->ctx = ctx;
-    shape->net = net;
+    dist_status status = disti_lanes_reserve(ctx, disti_block_layout(net, NULL, &b) +
+                                                      disti_wide_floats(ctx, net) * sizeof(float));
+    if (status == DIST_OK) status = disti_partial_for(ctx, (size_t)net->code_size);
+    if (status != DIST_OK) return status;
     shape->code = (float *)disti_alloc(ctx, (size_t)net->code_size * sizeof(float));
     shape->bias = (float *)disti_alloc(ctx, (size_t)(net->layers + 1) * (size_t)net->max_rows * sizeof(float));
-    if (!shape->code || !shape->bias) goto fail;
-    memset(shape->bias, 0, (size_t)(net->layers + 1) * (size_t)net->max_rows * sizeof(float));
+    if (!shape->code || !shape->bias) return DIST_OUT_OF_MEMORY;
 #ifndef DIST_NO_TRAIN
     if (net->sdf_channel >= 0 || net->color_channel >= 0) {
         size_t block = disti_store_offset(net, net->layers, DISTI_STORE_INPUT);
@@ -5851,10 +5893,27 @@ DIST_API dist_shape *dist_shape_create(dist_context *ctx, const dist_net *net, c
         shape->store_block_size = block;
         shape->store_blocks = (int)(blocks < 2 ? 2 : blocks > 32 ? 32 : blocks);
         shape->store = (float *)disti_alloc(ctx, (size_t)shape->store_blocks * block * sizeof(float));
-        if (!shape->store) goto fail;
-        memset(shape->store, 0, (size_t)shape->store_blocks * block * sizeof(float));
+        if (!shape->store) return DIST_OUT_OF_MEMORY;
     }
 #endif
+    return DIST_OK;
+}
+
+DIST_API dist_shape *dist_shape_create(dist_context *ctx, const dist_net *net, const float *code)
+{
+    if (disti_enter(ctx, "dist_shape_create") != DIST_OK) return NULL;
+    if (!net) {
+        disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_shape_create: net is NULL", NULL, 0, 0);
+        return NULL;
+    }
+    dist_shape *shape = (dist_shape *)disti_alloc(ctx, sizeof(dist_shape));
+    if (!shape) return NULL;
+    memset(shape, 0, sizeof *shape);
+    shape->ctx = ctx;
+    shape->net = net;
+    if (disti_shape_take(shape) != DIST_OK) goto fail;
+    memset(shape->bias, 0, (size_t)(net->layers + 1) * (size_t)net->max_rows * sizeof(float));
+    if (shape->store) memset(shape->store, 0, (size_t)shape->store_blocks * shape->store_block_size * sizeof(float));
     if (dist_shape_set_code(shape, code) != DIST_OK) goto fail;
     shape->lipschitz = shape->lipschitz_far = 1.0f;
     if (net->sdf_channel >= 0) {
@@ -5867,6 +5926,17 @@ fail:
     return NULL;
 }
 
+static dist_status disti_texture_check(dist_context *ctx, const dist_net *net, const dist_net *texture)
+{
+    const char *name = "dist_shape_set_texture";
+    if (texture->color_channel < 0)
+        return disti_fail(ctx, DIST_UNSUPPORTED, "%s: the net has no channels r,g,b", name, 0, 0);
+    if (texture->code_size < net->code_size)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: the texture's code has %d numbers, fewer than the shape's %d",
+                          name, texture->code_size, net->code_size);
+    return DIST_OK;
+}
+
 DIST_API dist_status dist_shape_set_texture(dist_shape *shape, const dist_net *texture, const float *color_code)
 {
     const char *name = "dist_shape_set_texture";
@@ -5874,12 +5944,8 @@ DIST_API dist_status dist_shape_set_texture(dist_shape *shape, const dist_net *t
     dist_context *ctx = shape->ctx;
     dist_shape *paint = NULL;
     dist_status status = disti_enter(ctx, name);
+    if (status == DIST_OK && texture) status = disti_texture_check(ctx, shape->net, texture);
     if (status != DIST_OK) return status;
-    if (texture && texture->color_channel < 0)
-        return disti_fail(ctx, DIST_UNSUPPORTED, "%s: the net has no channels r,g,b", name, 0, 0);
-    if (texture && texture->code_size < shape->net->code_size)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: the texture's code has %d numbers, fewer than the shape's %d",
-                          name, texture->code_size, shape->net->code_size);
     if (texture) {
         size_t own = (size_t)shape->net->code_size, size = (size_t)texture->code_size;
         paint = dist_shape_create(ctx, texture, NULL);
@@ -5969,15 +6035,19 @@ DIST_API void dist_net_destroy(dist_net *net)
     if (net) disti_net_free(net);
 }
 
-static dist_net *disti_net_new(dist_context *ctx)
+static void disti_net_begin(dist_context *ctx, dist_net *net)
 {
-    dist_net *net = (dist_net *)disti_alloc(ctx, sizeof(dist_net));
-    if (!net) return NULL;
     memset(net, 0, sizeof *net);
     net->allocator = ctx->allocator;
     net->first_scale = net->scale = 1.0f;
     net->sdf_channel = net->color_channel = -1;
     net->bound = 1.0f;
+}
+
+static dist_net *disti_net_new(dist_context *ctx)
+{
+    dist_net *net = (dist_net *)disti_alloc(ctx, sizeof(dist_net));
+    if (net) disti_net_begin(ctx, net);
     return net;
 }
 
@@ -6340,23 +6410,31 @@ static dist_status disti_loader_codes(disti_loader *loader)
     return DIST_OK;
 }
 
+static dist_status disti_loader_open(disti_loader *loader, dist_context *ctx, const void *bytes, size_t size)
+{
+    memset(loader, 0, sizeof *loader);
+    loader->ctx = ctx;
+    loader->function = "dist_net_load";
+    if (!bytes) return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_net_load: bytes is NULL", NULL, 0, 0);
+    return disti_archive_open(ctx, loader->function, bytes, size, &loader->archive);
+}
+
+/* From metadata and shapes all that loader->net (zeroed but for disti_net_begin) is but its numbers, and their memory. */
+static dist_status disti_loader_arrange(disti_loader *loader)
+{
+    if (disti_loader_meta(loader) != DIST_OK || disti_loader_shapes(loader) != DIST_OK ||
+        disti_loader_codes(loader) != DIST_OK)
+        return loader->status;
+    return disti_net_arrange(loader->ctx, loader->net, loader->function, loader->skip, loader->skip_scale);
+}
+
 DIST_API dist_net *dist_net_load(dist_context *ctx, const void *bytes, size_t size)
 {
     disti_loader loader;
     if (disti_enter(ctx, "dist_net_load") != DIST_OK) return NULL;
-    if (!bytes) {
-        disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_net_load: bytes is NULL", NULL, 0, 0);
-        return NULL;
-    }
-    memset(&loader, 0, sizeof loader);
-    loader.ctx = ctx;
-    loader.function = "dist_net_load";
-    int good = disti_archive_open(ctx, loader.function, bytes, size, &loader.archive) == DIST_OK;
-    if (good) loader.net = disti_net_new(ctx);
-    good = loader.net && disti_loader_meta(&loader) == DIST_OK && disti_loader_shapes(&loader) == DIST_OK &&
-           disti_loader_codes(&loader) == DIST_OK &&
-           disti_net_arrange(ctx, loader.net, loader.function, loader.skip, loader.skip_scale) == DIST_OK &&
-           disti_loader_values(&loader) == DIST_OK;
+    if (disti_loader_open(&loader, ctx, bytes, size) != DIST_OK) return NULL;
+    loader.net = disti_net_new(ctx);
+    int good = loader.net && disti_loader_arrange(&loader) == DIST_OK && disti_loader_values(&loader) == DIST_OK;
     if (good) disti_net_pack(loader.net);
     disti_archive_close(ctx, &loader.archive);
     if (good) return loader.net;
@@ -8819,32 +8897,47 @@ DIST_API void dist_tape_destroy(dist_tape *tape)
     disti_free(tape->ctx, tape, sizeof *tape);
 }
 
-DIST_API dist_tape *dist_tape_create(dist_context *ctx, const dist_camera *camera, const dist_render_desc *desc)
+/* The memory of a tape for a camera and settings that have been checked, but for its own. */
+static dist_status disti_tape_take(dist_context *ctx, dist_tape *tape, const dist_camera *camera,
+                                   const dist_render_desc *desc)
 {
-    const char *name = "dist_tape_create";
-    dist_render_desc raw;
-    if (disti_enter(ctx, name) != DIST_OK || disti_camera_check(ctx, camera, name) != DIST_OK) return NULL;
-    memset(&raw, 0, sizeof raw);
-    if (desc) raw = *desc;
-    if (disti_how_check(ctx, &raw, name) != DIST_OK) return NULL;
-    if (disti_partial_reserve(ctx, 1024) != DIST_OK) return NULL; /* for codes of fields that are not nets */
-    dist_tape *tape = (dist_tape *)disti_alloc(ctx, sizeof(dist_tape));
-    if (!tape) return NULL;
+    dist_render_desc how = dist_render_desc_resolve(desc);
     memset(tape, 0, sizeof *tape);
-    raw = dist_render_desc_resolve(desc);
     tape->ctx = ctx;
     tape->width = camera->width;
     tape->height = camera->height;
-    tape->trace = raw.trace;
-    tape->samples = raw.samples;
+    tape->trace = how.trace;
+    tape->samples = how.samples;
+    dist_status status = disti_partial_reserve(ctx, 1024); /* for codes of fields that are not nets */
+    if (status != DIST_OK) return status;
     tape->s = (float *)disti_alloc(ctx, disti_tape_bytes(tape, 0));
     tape->status = tape->s ? (unsigned char *)disti_alloc(ctx, disti_tape_bytes(tape, 1)) : NULL;
-    if (tape->status && raw.trace == DIST_TRACE_PAPER)
+    if (tape->status && how.trace == DIST_TRACE_PAPER)
         tape->sample = (float *)disti_alloc(ctx, disti_tape_bytes(tape, 2));
-    if (tape->status && raw.warm_start) tape->value = (float *)disti_alloc(ctx, disti_tape_bytes(tape, 5));
+    if (tape->status && how.warm_start) tape->value = (float *)disti_alloc(ctx, disti_tape_bytes(tape, 5));
     tape->entry = tape->status ? (disti_entry *)disti_alloc(ctx, disti_tape_bytes(tape, 3)) : NULL;
     tape->points = tape->entry ? (float *)disti_alloc(ctx, disti_tape_bytes(tape, 4)) : NULL;
-    if (!tape->points || (raw.trace == DIST_TRACE_PAPER && !tape->sample) || (raw.warm_start && !tape->value)) {
+    if (!tape->points || (how.trace == DIST_TRACE_PAPER && !tape->sample) || (how.warm_start && !tape->value))
+        return DIST_OUT_OF_MEMORY;
+    return DIST_OK;
+}
+
+static dist_status disti_tape_check(dist_context *ctx, const dist_camera *camera, const dist_render_desc *desc)
+{
+    const char *name = "dist_tape_create";
+    dist_render_desc raw;
+    memset(&raw, 0, sizeof raw);
+    if (desc) raw = *desc;
+    dist_status status = disti_camera_check(ctx, camera, name);
+    return status == DIST_OK ? disti_how_check(ctx, &raw, name) : status;
+}
+
+DIST_API dist_tape *dist_tape_create(dist_context *ctx, const dist_camera *camera, const dist_render_desc *desc)
+{
+    if (disti_enter(ctx, "dist_tape_create") != DIST_OK || disti_tape_check(ctx, camera, desc) != DIST_OK) return NULL;
+    dist_tape *tape = (dist_tape *)disti_alloc(ctx, sizeof(dist_tape));
+    if (!tape) return NULL;
+    if (disti_tape_take(ctx, tape, camera, desc) != DIST_OK) {
         dist_tape_destroy(tape);
         return NULL;
     }
@@ -8859,6 +8952,119 @@ DIST_API dist_tape *dist_tape_create(dist_context *ctx, const dist_camera *camer
     tape->pull = tape->d_color + 3 * (size_t)DISTI_RUN;
     tape->bend = tape->pull + 3 * (size_t)DISTI_RUN;
     return tape;
+}
+
+/* What dist_workspace_bytes hands to the create functions' own code: it adds up what is asked for and gives an address
+   that is never read. Only an archive's table of contents, which is read, comes from a real allocator. */
+typedef struct disti_measure {
+    size_t bytes;
+    int real; /* the next requests are passed on */
+    dist_allocator allocator;
+} disti_measure;
+
+static void *disti_measure_alloc(void *user, size_t bytes, size_t alignment)
+{
+    disti_measure *m = (disti_measure *)user;
+    size_t whole;
+    if (!disti_size_add(bytes, DISTI_ALIGNMENT - 1, &whole) ||
+        !disti_size_add(m->bytes, whole & ~(size_t)(DISTI_ALIGNMENT - 1), &m->bytes))
+        return NULL;
+    if (!m->real) return m;
+    return m->allocator.alloc_fn ? m->allocator.alloc_fn(m->allocator.user, bytes, alignment) : NULL;
+}
+
+static void disti_measure_free(void *user, void *pointer, size_t bytes)
+{
+    const disti_measure *m = (const disti_measure *)user;
+    if (pointer != user) m->allocator.free_fn(m->allocator.user, pointer, bytes);
+}
+
+/* As dist_net_load, without numbers. */
+static dist_status disti_measure_net(dist_context *ctx, disti_measure *m, const void *bytes, size_t size, dist_net *net)
+{
+    disti_loader loader;
+    m->real = 1;
+    dist_status status = disti_loader_open(&loader, ctx, bytes, size);
+    m->real = 0;
+    if (status != DIST_OK) return status;
+    disti_alloc(ctx, sizeof *net);
+    disti_net_begin(ctx, net);
+    loader.net = net;
+    status = disti_loader_arrange(&loader);
+    disti_archive_close(ctx, &loader.archive);
+    return status;
+}
+
+/* Its shapes and scene. net and texture may be NULL. */
+static dist_status disti_measure_shapes(dist_context *ctx, const dist_net *net, const dist_net *texture, int shapes,
+                                        int instances)
+{
+    dist_shape shape, paint;
+    dist_scene scene;
+    dist_status status = DIST_OK;
+    for (int i = 0; net && i < shapes && status == DIST_OK; i++) {
+        memset(&shape, 0, sizeof shape);
+        disti_alloc(ctx, sizeof shape);
+        shape.ctx = ctx;
+        shape.net = net;
+        status = disti_shape_take(&shape);
+        if (!texture || status != DIST_OK) continue;
+        paint = shape;
+        disti_alloc(ctx, sizeof paint);
+        paint.net = texture;
+        shape.texture = &paint;
+        status = disti_shape_take(&paint);
+    }
+    if (status != DIST_OK || instances == 0) return status;
+    memset(&scene, 0, sizeof scene);
+    disti_alloc(ctx, sizeof scene);
+    scene.ctx = ctx;
+    scene.count = instances;
+    status = disti_scene_take(&scene);
+    if (status != DIST_OK) return status;
+    dist_field field = dist_shape_field(&shape);
+    return disti_partial_for(ctx, (size_t)instances * (disti_field_code(&field) + 7 + (size_t)field.color_code_size));
+}
+
+DIST_API size_t dist_workspace_bytes(const dist_workspace_desc *desc)
+{
+    dist_workspace_desc d;
+    dist_context_desc context;
+    dist_context ctx;
+    dist_net net, texture;
+    dist_tape tape;
+    disti_measure m;
+    dist_allocator counting;
+    const char *name = "dist_workspace_bytes";
+    memset(&d, 0, sizeof d);
+    memset(&context, 0, sizeof context);
+    memset(&m, 0, sizeof m);
+    if (desc) d = *desc;
+    if (d.context) context = *d.context;
+    if (!disti_allocator_of(&context, &m.allocator)) memset(&m.allocator, 0, sizeof m.allocator);
+    counting.user = &m;
+    counting.alloc_fn = disti_measure_alloc;
+    counting.free_fn = disti_measure_free;
+    disti_measure_alloc(&m, sizeof ctx, DISTI_ALIGNMENT);
+    dist_status status = disti_context_begin(&ctx, &context, &counting);
+    if (status == DIST_OK && d.model) status = disti_measure_net(&ctx, &m, d.model, d.model_size, &net);
+    if (status == DIST_OK && d.texture) status = disti_measure_net(&ctx, &m, d.texture, d.texture_size, &texture);
+    if (status != DIST_OK) return 0;
+    const dist_net *shaped = d.model ? &net : d.net, *colored = d.texture ? &texture : d.texture_net;
+    if (d.shapes < 0 || d.shapes > 1 << 20 || d.instances < 0 || d.instances > 1 << 20 ||
+        (!shaped && (d.shapes || d.instances || colored)))
+        status = disti_fail(&ctx, DIST_BAD_ARGUMENT,
+                            "%s: shapes is %d, instances %d; must be 0 to 2^20, and 0 without a net", name,
+                            d.shapes, d.instances);
+    if (status == DIST_OK && colored) status = disti_texture_check(&ctx, shaped, colored);
+    if (status == DIST_OK)
+        status = disti_measure_shapes(&ctx, shaped, colored, d.shapes ? d.shapes : 1, d.instances);
+    if (status == DIST_OK && d.camera) {
+        status = disti_tape_check(&ctx, d.camera, d.how);
+        disti_alloc(&ctx, sizeof tape);
+        if (status == DIST_OK) status = disti_tape_take(&ctx, &tape, d.camera, d.how);
+    }
+    return status == DIST_OK && m.bytes != (size_t)-1 ? m.bytes : 0;
 }
 
 /* Half a pixel's width at unit distance: cos^2 / (2 f), with the larger of the focal lengths. */

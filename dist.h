@@ -1347,7 +1347,8 @@ static dist_status disti_context_check(dist_context *ctx, const dist_context_des
 
 /* All of dist_context_create but the memory of ctx itself. DIST_OUT_OF_MEMORY: nothing is held; after any other failure
    the context refuses everything. */
-static dist_status disti_context_begin(dist_context *ctx, const dist_context_desc *desc, const dist_allocator *allocator)
+static dist_status disti_context_begin(dist_context *ctx, const dist_context_desc *desc,
+                                       const dist_allocator *allocator)
 {
     memset(ctx, 0, sizeof *ctx);
     ctx->allocator = *allocator;
@@ -6419,7 +6420,7 @@ static dist_status disti_loader_open(disti_loader *loader, dist_context *ctx, co
     return disti_archive_open(ctx, loader->function, bytes, size, &loader->archive);
 }
 
-/* From metadata and shapes all that loader->net (zeroed but for disti_net_begin) is but its numbers, and their memory. */
+/* From metadata and shapes all of loader->net (zeroed but for disti_net_begin) but its numbers, and their memory. */
 static dist_status disti_loader_arrange(disti_loader *loader)
 {
     if (disti_loader_meta(loader) != DIST_OK || disti_loader_shapes(loader) != DIST_OK ||

@@ -42,6 +42,7 @@
    Contents:
    @ 01 config, status, hooks   @ 02 context   @ 03 kernels   @ 04 field   @ 05 net   @ 06 camera
    @ 07 trace   @ 08 render   @ 09 loss   @ 10 optimizer   @ 11 mesh, metrics   @ 12 files
+   @ 13 workspace
 */
 #ifndef DIST_H
 #define DIST_H
@@ -574,26 +575,6 @@ DIST_API void dist_tape_destroy(dist_tape *tape);
 DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, const dist_camera *camera,
                                  const dist_render_desc *desc, const dist_images *out, dist_tape *tape);
 
-/* What is to be made, in this order. Zero or NULL: not this. */
-typedef struct dist_workspace_desc {
-    const dist_context_desc *context; /* dist_context_create; NULL: its defaults */
-    const void *model, *texture;      /* dist_net_load of these bytes, for the shapes and for their texture */
-    size_t model_size, texture_size;
-    const dist_net *net, *texture_net; /* instead: nets that are there already, loaded elsewhere */
-    int shapes;    /* dist_shape_create as often, each with dist_shape_set_texture; 0: once, where there is a net */
-    int instances; /* dist_scene_create of so many of these shapes */
-    const dist_camera *camera; /* dist_tape_create for it and how. The size of a picture without a tape, its planes and
-                                  what of it is wanted cost no memory */
-    const dist_render_desc *how;
-} dist_workspace_desc;
-/* The bytes that an arena needs which hands out one piece after another, from an address that is a multiple of 64 and
-   each rounded up to one, and takes nothing back: exactly; with one less some create function fails with
-   DIST_OUT_OF_MEMORY. The create functions' own code is run without memory. dist_net_load_file needs its file's bytes
-   besides, meshes and Chamfer distance theirs.
-   0: a create function would refuse; desc->context->logger is told why. The table of contents of a model is read into
-   memory of desc->context->allocator, or malloc's, and given back. */
-DIST_API size_t dist_workspace_bytes(const dist_workspace_desc *desc);
-
 #ifndef DIST_NO_BACKWARD
 /* Adjoint of the dist_render that filled the tape: reads d_out's depth, distance, normal, silhouette, color; adds to
    grads; with how.relax_band color also at misses: outlines move, though not those that lie before another surface.
@@ -742,6 +723,28 @@ DIST_API dist_mesh *dist_mesh_load(dist_context *ctx, const char *path);
 DIST_API dist_status dist_mesh_save(dist_context *ctx, const dist_mesh *mesh, const char *path);
 #endif
 #endif
+
+/* ---- 13 workspace ------------------------------------------------------------------------------------------------ */
+
+/* What is to be made, in this order. Zero or NULL: not this. */
+typedef struct dist_workspace_desc {
+    const dist_context_desc *context; /* dist_context_create; NULL: its defaults */
+    const void *model, *texture;      /* dist_net_load of these bytes, for the shapes and for their texture */
+    size_t model_size, texture_size;
+    const dist_net *net, *texture_net; /* instead: nets that are there already, loaded elsewhere */
+    int shapes;    /* dist_shape_create as often, each with dist_shape_set_texture; 0: once, where there is a net */
+    int instances; /* dist_scene_create of so many of these shapes */
+    const dist_camera *camera; /* dist_tape_create for it and how. The size of a picture without a tape, its planes and
+                                  what of it is wanted cost no memory */
+    const dist_render_desc *how;
+} dist_workspace_desc;
+/* The bytes that an arena needs which hands out one piece after another, from an address that is a multiple of 64 and
+   each rounded up to one, and takes nothing back: exactly; with one less some create function fails with
+   DIST_OUT_OF_MEMORY. The create functions' own code is run without memory. dist_net_load_file needs its file's bytes
+   besides, meshes and Chamfer distance theirs.
+   0: a create function would refuse; desc->context->logger is told why. The table of contents of a model is read into
+   memory of desc->context->allocator, or malloc's, and given back. */
+DIST_API size_t dist_workspace_bytes(const dist_workspace_desc *desc);
 
 #ifdef __cplusplus
 }
@@ -8955,119 +8958,6 @@ DIST_API dist_tape *dist_tape_create(dist_context *ctx, const dist_camera *camer
     return tape;
 }
 
-/* What dist_workspace_bytes hands to the create functions' own code: it adds up what is asked for and gives an address
-   that is never read. Only an archive's table of contents, which is read, comes from a real allocator. */
-typedef struct disti_measure {
-    size_t bytes;
-    int real; /* the next requests are passed on */
-    dist_allocator allocator;
-} disti_measure;
-
-static void *disti_measure_alloc(void *user, size_t bytes, size_t alignment)
-{
-    disti_measure *m = (disti_measure *)user;
-    size_t whole;
-    if (!disti_size_add(bytes, DISTI_ALIGNMENT - 1, &whole) ||
-        !disti_size_add(m->bytes, whole & ~(size_t)(DISTI_ALIGNMENT - 1), &m->bytes))
-        return NULL;
-    if (!m->real) return m;
-    return m->allocator.alloc_fn ? m->allocator.alloc_fn(m->allocator.user, bytes, alignment) : NULL;
-}
-
-static void disti_measure_free(void *user, void *pointer, size_t bytes)
-{
-    const disti_measure *m = (const disti_measure *)user;
-    if (pointer != user) m->allocator.free_fn(m->allocator.user, pointer, bytes);
-}
-
-/* As dist_net_load, without numbers. */
-static dist_status disti_measure_net(dist_context *ctx, disti_measure *m, const void *bytes, size_t size, dist_net *net)
-{
-    disti_loader loader;
-    m->real = 1;
-    dist_status status = disti_loader_open(&loader, ctx, bytes, size);
-    m->real = 0;
-    if (status != DIST_OK) return status;
-    disti_alloc(ctx, sizeof *net);
-    disti_net_begin(ctx, net);
-    loader.net = net;
-    status = disti_loader_arrange(&loader);
-    disti_archive_close(ctx, &loader.archive);
-    return status;
-}
-
-/* Its shapes and scene. net and texture may be NULL. */
-static dist_status disti_measure_shapes(dist_context *ctx, const dist_net *net, const dist_net *texture, int shapes,
-                                        int instances)
-{
-    dist_shape shape, paint;
-    dist_scene scene;
-    dist_status status = DIST_OK;
-    for (int i = 0; net && i < shapes && status == DIST_OK; i++) {
-        memset(&shape, 0, sizeof shape);
-        disti_alloc(ctx, sizeof shape);
-        shape.ctx = ctx;
-        shape.net = net;
-        status = disti_shape_take(&shape);
-        if (!texture || status != DIST_OK) continue;
-        paint = shape;
-        disti_alloc(ctx, sizeof paint);
-        paint.net = texture;
-        shape.texture = &paint;
-        status = disti_shape_take(&paint);
-    }
-    if (status != DIST_OK || instances == 0) return status;
-    memset(&scene, 0, sizeof scene);
-    disti_alloc(ctx, sizeof scene);
-    scene.ctx = ctx;
-    scene.count = instances;
-    status = disti_scene_take(&scene);
-    if (status != DIST_OK) return status;
-    dist_field field = dist_shape_field(&shape);
-    return disti_partial_for(ctx, (size_t)instances * (disti_field_code(&field) + 7 + (size_t)field.color_code_size));
-}
-
-DIST_API size_t dist_workspace_bytes(const dist_workspace_desc *desc)
-{
-    dist_workspace_desc d;
-    dist_context_desc context;
-    dist_context ctx;
-    dist_net net, texture;
-    dist_tape tape;
-    disti_measure m;
-    dist_allocator counting;
-    const char *name = "dist_workspace_bytes";
-    memset(&d, 0, sizeof d);
-    memset(&context, 0, sizeof context);
-    memset(&m, 0, sizeof m);
-    if (desc) d = *desc;
-    if (d.context) context = *d.context;
-    if (!disti_allocator_of(&context, &m.allocator)) memset(&m.allocator, 0, sizeof m.allocator);
-    counting.user = &m;
-    counting.alloc_fn = disti_measure_alloc;
-    counting.free_fn = disti_measure_free;
-    disti_measure_alloc(&m, sizeof ctx, DISTI_ALIGNMENT);
-    dist_status status = disti_context_begin(&ctx, &context, &counting);
-    if (status == DIST_OK && d.model) status = disti_measure_net(&ctx, &m, d.model, d.model_size, &net);
-    if (status == DIST_OK && d.texture) status = disti_measure_net(&ctx, &m, d.texture, d.texture_size, &texture);
-    if (status != DIST_OK) return 0;
-    const dist_net *shaped = d.model ? &net : d.net, *colored = d.texture ? &texture : d.texture_net;
-    if (d.shapes < 0 || d.shapes > 1 << 20 || d.instances < 0 || d.instances > 1 << 20 ||
-        (!shaped && (d.shapes || d.instances || colored)))
-        status = disti_fail(&ctx, DIST_BAD_ARGUMENT,
-                            "%s: shapes is %d, instances %d; must be 0 to 2^20, and 0 without a net", name,
-                            d.shapes, d.instances);
-    if (status == DIST_OK && colored) status = disti_texture_check(&ctx, shaped, colored);
-    if (status == DIST_OK)
-        status = disti_measure_shapes(&ctx, shaped, colored, d.shapes ? d.shapes : 1, d.instances);
-    if (status == DIST_OK && d.camera) {
-        status = disti_tape_check(&ctx, d.camera, d.how);
-        disti_alloc(&ctx, sizeof tape);
-        if (status == DIST_OK) status = disti_tape_take(&ctx, &tape, d.camera, d.how);
-    }
-    return status == DIST_OK && m.bytes != (size_t)-1 ? m.bytes : 0;
-}
-
 /* Half a pixel's width at unit distance: cos^2 / (2 f), with the larger of the focal lengths. */
 static double disti_view_footprint(const disti_view *view, double cosine)
 {
@@ -12419,6 +12309,121 @@ DIST_API dist_status dist_mesh_save(dist_context *ctx, const dist_mesh *mesh, co
 }
 #endif
 #endif
+
+/*@ 13 workspace ---------------------------------------------------------------------------------------------------- */
+
+/* What dist_workspace_bytes hands to the create functions' own code: it adds up what is asked for and gives an address
+   that is never read. Only an archive's table of contents, which is read, comes from a real allocator. */
+typedef struct disti_measure {
+    size_t bytes;
+    int real; /* the next requests are passed on */
+    dist_allocator allocator;
+} disti_measure;
+
+static void *disti_measure_alloc(void *user, size_t bytes, size_t alignment)
+{
+    disti_measure *m = (disti_measure *)user;
+    size_t whole;
+    if (!disti_size_add(bytes, DISTI_ALIGNMENT - 1, &whole) ||
+        !disti_size_add(m->bytes, whole & ~(size_t)(DISTI_ALIGNMENT - 1), &m->bytes))
+        return NULL;
+    if (!m->real) return m;
+    return m->allocator.alloc_fn ? m->allocator.alloc_fn(m->allocator.user, bytes, alignment) : NULL;
+}
+
+static void disti_measure_free(void *user, void *pointer, size_t bytes)
+{
+    const disti_measure *m = (const disti_measure *)user;
+    if (pointer != user) m->allocator.free_fn(m->allocator.user, pointer, bytes);
+}
+
+/* As dist_net_load, without numbers. */
+static dist_status disti_measure_net(dist_context *ctx, disti_measure *m, const void *bytes, size_t size, dist_net *net)
+{
+    disti_loader loader;
+    m->real = 1;
+    dist_status status = disti_loader_open(&loader, ctx, bytes, size);
+    m->real = 0;
+    if (status != DIST_OK) return status;
+    disti_alloc(ctx, sizeof *net);
+    disti_net_begin(ctx, net);
+    loader.net = net;
+    status = disti_loader_arrange(&loader);
+    disti_archive_close(ctx, &loader.archive);
+    return status;
+}
+
+/* Its shapes and scene. net and texture may be NULL. */
+static dist_status disti_measure_shapes(dist_context *ctx, const dist_net *net, const dist_net *texture, int shapes,
+                                        int instances)
+{
+    dist_shape shape, paint;
+    dist_scene scene;
+    dist_status status = DIST_OK;
+    for (int i = 0; net && i < shapes && status == DIST_OK; i++) {
+        memset(&shape, 0, sizeof shape);
+        disti_alloc(ctx, sizeof shape);
+        shape.ctx = ctx;
+        shape.net = net;
+        status = disti_shape_take(&shape);
+        if (!texture || status != DIST_OK) continue;
+        paint = shape;
+        disti_alloc(ctx, sizeof paint);
+        paint.net = texture;
+        shape.texture = &paint;
+        status = disti_shape_take(&paint);
+    }
+    if (status != DIST_OK || instances == 0) return status;
+    memset(&scene, 0, sizeof scene);
+    disti_alloc(ctx, sizeof scene);
+    scene.ctx = ctx;
+    scene.count = instances;
+    status = disti_scene_take(&scene);
+    if (status != DIST_OK) return status;
+    dist_field field = dist_shape_field(&shape);
+    return disti_partial_for(ctx, (size_t)instances * (disti_field_code(&field) + 7 + (size_t)field.color_code_size));
+}
+
+DIST_API size_t dist_workspace_bytes(const dist_workspace_desc *desc)
+{
+    dist_workspace_desc d;
+    dist_context_desc context;
+    dist_context ctx;
+    dist_net net, texture;
+    dist_tape tape;
+    disti_measure m;
+    dist_allocator counting;
+    const char *name = "dist_workspace_bytes";
+    memset(&d, 0, sizeof d);
+    memset(&context, 0, sizeof context);
+    memset(&m, 0, sizeof m);
+    if (desc) d = *desc;
+    if (d.context) context = *d.context;
+    if (!disti_allocator_of(&context, &m.allocator)) memset(&m.allocator, 0, sizeof m.allocator);
+    counting.user = &m;
+    counting.alloc_fn = disti_measure_alloc;
+    counting.free_fn = disti_measure_free;
+    disti_measure_alloc(&m, sizeof ctx, DISTI_ALIGNMENT);
+    dist_status status = disti_context_begin(&ctx, &context, &counting);
+    if (status == DIST_OK && d.model) status = disti_measure_net(&ctx, &m, d.model, d.model_size, &net);
+    if (status == DIST_OK && d.texture) status = disti_measure_net(&ctx, &m, d.texture, d.texture_size, &texture);
+    if (status != DIST_OK) return 0;
+    const dist_net *shaped = d.model ? &net : d.net, *colored = d.texture ? &texture : d.texture_net;
+    if (d.shapes < 0 || d.shapes > 1 << 20 || d.instances < 0 || d.instances > 1 << 20 ||
+        (!shaped && (d.shapes || d.instances || colored)))
+        status = disti_fail(&ctx, DIST_BAD_ARGUMENT,
+                            "%s: shapes is %d, instances %d; must be 0 to 2^20, and 0 without a net", name,
+                            d.shapes, d.instances);
+    if (status == DIST_OK && colored) status = disti_texture_check(&ctx, shaped, colored);
+    if (status == DIST_OK)
+        status = disti_measure_shapes(&ctx, shaped, colored, d.shapes ? d.shapes : 1, d.instances);
+    if (status == DIST_OK && d.camera) {
+        status = disti_tape_check(&ctx, d.camera, d.how);
+        disti_alloc(&ctx, sizeof tape);
+        if (status == DIST_OK) status = disti_tape_take(&ctx, &tape, d.camera, d.how);
+    }
+    return status == DIST_OK && m.bytes != (size_t)-1 ? m.bytes : 0;
+}
 
 #undef DISTI_RESTRICT
 #undef DISTI_TARGET

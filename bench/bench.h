@@ -45,8 +45,8 @@ static inline dist_net *load_net_or_skip(dist_context *ctx, const char *name)
     return load_model(ctx, path);
 }
 
-/* 2.2 radii away, azimuth 35, elevation 25 degrees, a focal length of 385 pixels at 512 (of the shorter side): then about
-   121,000 rays of 512 x 512 meet the bounding sphere, as in the paper's table of queries. */
+/* 2.2 radii away, azimuth 35, elevation 25 degrees, a focal length of 385 pixels at 512 (of the shorter side): then
+   about 121,000 rays of 512 x 512 meet the bounding sphere, as in the paper's table of queries. */
 static inline dist_camera bench_camera(const dist_field *field, int width, int height)
 {
     const float azimuth = 35.0f * PI / 180.0f;

@@ -11,4 +11,5 @@ compiler=$(${CC:-cc} --version 2>/dev/null | head -n 1)
 version=$(sed -n 's/^#define DIST_VERSION_M[AI][A-Z]* //p; s/^#define DIST_VERSION_PATCH //p' dist.h | paste -s -d . -)
 commit=$(git rev-parse --short HEAD 2>/dev/null || echo unknown)
 [ -z "$(git status --porcelain -uno -- . ':!bench/results' 2>/dev/null)" ] || commit="$commit+"
-echo "${name:-$(uname -m)}$speed, $cores cores; ${compiler:-unknown compiler} ${CFLAGS:+$CFLAGS}; dist.h $version, commit $commit"
+echo "${name:-$(uname -m)}$speed, $cores cores; ${compiler:-unknown compiler}${CFLAGS:+ $CFLAGS};" \
+    "dist.h $version, commit $commit"

@@ -164,7 +164,7 @@ static inline double plot_text_width(const char *text, double size)
     double n = 0;
     for (const char *c = text; *c; c++) {
         int narrow = strchr("iljtfrI1.,:;'|!()[] ", *c) != NULL;
-        n += ((unsigned char)*c & 0xC0) == 0x80 ? 0 : narrow ? 0.38 : *c < 'a' ? 0.66 : 0.57;
+        n += ((unsigned char)*c & 0xC0) == 0x80 ? 0 : narrow ? 0.4 : *c < 'a' ? 0.7 : 0.64;
     }
     return n * size;
 }

@@ -14,6 +14,10 @@ for file in examples/*.c; do
         expect "${name}_is_strict_clang" clang -std=c99 $warnings -Wmissing-prototypes -fsyntax-only "$file"
     fi
 done
+# In a fixed arena: as many bytes used as were asked for, and no allocator of the C library's linked in.
+expect arena_runs_in_what_it_asked_for "$work/arena"
+nm -u "$work/arena" 2>/dev/null | grep -E ' (malloc|calloc|realloc|aligned_alloc|posix_memalign|free)(@|$)' >"$work/found"
+expect_nothing arena_links_no_malloc "$work/found"
 for file in bench/*.c tools/*.c; do
     [ -e "$file" ] || continue
     name=$(basename "$file" .c)

@@ -9,6 +9,7 @@
 int fit_photos_main(int argc, char **argv);
 #include "../examples/fit_photos.c"
 #undef main
+#include "plot.h"
 #include "results.h"
 
 static const char results_usage[] =
@@ -85,7 +86,7 @@ static void run_jobs(const dist_net *net, int count, job *jobs)
 /* Of the jobs of one part, family, level and method. */
 typedef struct summary {
     int count, good;
-    double start, end, worst, seconds; /* medians, Chamfer x 1000 */
+    double start, end, best, worst, seconds; /* start, end, seconds: medians; Chamfer x 1000 */
 } summary;
 
 static summary summary_of(int count, const job *jobs, const char *part, const char *family, float level, int mesh)
@@ -104,6 +105,7 @@ static summary summary_of(int count, const job *jobs, const char *part, const ch
         end[n] = 1000 * j->scores[1].chamfer;
         seconds[n++] = j->seconds;
         s.good += 3 * j->scores[1].chamfer <= j->scores[0].chamfer;
+        s.best = n == 1 ? end[0] : fmin(s.best, 1000 * j->scores[1].chamfer);
         s.worst = fmax(s.worst, 1000 * j->scores[1].chamfer);
     }
     s.count = (int)n;
@@ -113,26 +115,32 @@ static summary summary_of(int count, const job *jobs, const char *part, const ch
     return s;
 }
 
-static void plot_part(const results *r, int count, const job *jobs, const char *part, int levels, const float *level,
-                      const char *x_label)
+/* Both figures of robustness: medians, and from the best to the worst. */
+static void write_plot(const results *r, int count, const job *jobs)
 {
     static const char *const names[2] = {"rays", "mesh"};
-    double x[8], y[2][8];
-    curve curves[2];
-    char name[64], path[PATH_SIZE];
-    for (int mesh = 0; mesh < 2; mesh++) {
-        for (int i = 0; i < levels; i++) {
-            x[i] = (double)level[i];
-            y[mesh][i] = summary_of(count, jobs, part, "car", level[i], mesh).end;
+    char path[PATH_SIZE];
+    plot p = plot_begin("Shapes from photos: cars", "rays: the sphere tracer; mesh: extracted anew in every step", 2);
+    plot_panel *a = plot_add_panel(&p, "noise in the start", "root mean squares of the codes",
+                                   "Chamfer distance x 1000", PLOT_LOG_Y);
+    for (int part = 0; part < 2; part++) {
+        const char *wanted = part ? "focal" : "noise";
+        if (part) {
+            a = plot_add_panel(&p, "another focal length", "times the table's", "Chamfer distance x 1000",
+                               PLOT_LOG_X | PLOT_LOG_Y);
         }
-        curves[mesh].name = names[mesh];
-        curves[mesh].n = (size_t)levels;
-        curves[mesh].x = x;
-        curves[mesh].y = y[mesh];
+        for (int i = 0; i < count; i++) {
+            summary s = summary_of(count, jobs, wanted, "car", jobs[i].level, jobs[i].mesh);
+            if (strcmp(jobs[i].part, wanted) != 0 || jobs[i].seed != 1) { continue; }
+            plot_point *q = plot_add(plot_series_of(a, names[jobs[i].mesh]), (double)jobs[i].level, s.end);
+            q->y_low = s.best;
+            q->y_high = s.worst;
+            q->open = s.good < s.count;
+        }
     }
-    snprintf(name, sizeof name, "photos_%s", part);
-    write_curves(path_of(path, results_stem(r, name), ".svg"), "shapes from photos", x_label, "Chamfer x 1000, median",
-                 2, curves, 1);
+    p.open_means = "some end above a third of the start's distance";
+    p.notes[0] = "bars: from the best to the worst";
+    plot_write(&p, path_of(path, results_stem(r, "photos"), ".svg"), results_machine());
     puts(path);
 }
 
@@ -157,16 +165,18 @@ static void write_section(const results *r, int count, const job *jobs, int nois
     static const char *const published[2] = {"0.661 / 1.187 / 0.919", "1.129 / 6.124 / 1.595"};
     FILE *md = results_section(r, "photos", "Shapes from photos, by rays and by a mesh", "build/results_photos");
     fprintf(md, "From a random code, posed photos alone (no mask, no depth). Chamfer distance x 1000 from the truth to "
-                "the shape, median (worst); good: a third of the start's or less. The published numbers are of other "
+                "the shape, median (worst); good: a third of the start's or less. "
+                "Seconds: of one thread, wall clock, without the scores. The published numbers are of other "
                 "shapes and decoders, and PMO is another program with its own training.\n\n"
-                "| | start | rays | good | mesh | good | published: PMO / PMO random / paper |\n"
-                "|---|---|---|---|---|---|---|\n");
+                "| | start | rays | good | seconds | mesh | good | seconds | published: PMO / PMO random / paper |\n"
+                "|---|---|---|---|---|---|---|---|---|\n");
     for (int k = 0; k < 2; k++) {
         summary a = summary_of(count, jobs, "table", families[k], 0, 0);
         summary b = summary_of(count, jobs, "table", families[k], 0, 1);
         if (!a.count) { continue; }
-        fprintf(md, "| %ss | %.1f | %.2f (%.2f) | %d of %d | %.2f (%.2f) | %d of %d | %s |\n", families[k], a.start,
-                a.end, a.worst, a.good, a.count, b.end, b.worst, b.good, b.count, published[k]);
+        fprintf(md, "| %ss | %.1f | %.2f (%.2f) | %d of %d | %.1f | %.2f (%.2f) | %d of %d | %.1f | %s |\n",
+                families[k], a.start, a.end, a.worst, a.good, a.count, a.seconds, b.end, b.worst, b.good, b.count, b.seconds,
+                published[k]);
     }
     fprintf(md, "\nRobustness, cars: the start is the true code with noise (in root mean squares of the decoder's "
                 "codes), or random with photos of another focal length, which the fit knows.\n\n"
@@ -180,7 +190,7 @@ static void write_section(const results *r, int count, const job *jobs, int nois
                 k < noises ? "noise" : "focal length x", (double)level, a.start, a.end, a.worst, a.good, a.count, b.end,
                 b.worst, b.good, b.count);
     }
-    fputs("\n![noise](photos_noise.svg) ![focal length](photos_focal.svg)\n", md);
+    fputs("\n![noise in the start, focal length](photos.svg)\n", md);
     results_close(r, md, "photos", ".md");
 }
 
@@ -242,8 +252,7 @@ int main(int argc, char **argv)
     dist_net *net = load_model(ctx, "embedded");
     run_jobs(net, count, jobs);
     write_csv(&r, count, jobs);
-    plot_part(&r, count, jobs, "noise", levels, noise, "noise of the start, root mean squares of the codes");
-    plot_part(&r, count, jobs, "focal", levels, focal, "focal length, times that of the table");
+    write_plot(&r, count, jobs);
     write_section(&r, count, jobs, levels, noise, levels, focal);
     dist_net_destroy(net);
     dist_context_destroy(ctx);

@@ -7,13 +7,15 @@
 #   make matrix         the tests under every compiler, option and instruction set that this machine has
 #   make matrix-quick   the part of it that every change must pass
 #   make bench          the benchmarks in short, csv; build/bench_NAME --help tells what else they do
+#   make results        the paper's tables and figures with ours beside them, into bench/results/: below an hour
+#   make results-quick  the same in small, into build/results/: a minute or two
 #   make clean
 
 CC = cc
 CXX = c++
 CFLAGS = -O2
 DEMO_COMMAND = build/fit_depth --demo --out out/demo
-BENCH_COMMAND = for b in $(BENCHES); do echo "$$b"; ./$$b --quick || exit 1; done
+BENCH_COMMAND = for b in $(filter build/bench_%,$(BENCHES)); do echo "$$b"; ./$$b --quick || exit 1; done
 
 STRICT = -std=c99 -Wall -Wextra -Wpedantic -Wconversion -Wsign-conversion -Wshadow -Wcast-qual -Wundef \
          -Wdouble-promotion -Wmissing-prototypes -Werror
@@ -23,6 +25,7 @@ TEST_FLAGS = $(STRICT)
 
 PROGRAMS = $(patsubst examples/%.c,build/%,$(wildcard examples/*.c)) $(patsubst tools/%.c,build/%,$(wildcard tools/*.c))
 BENCHES = $(patsubst bench/%.c,build/%,$(wildcard bench/*.c))
+RESULTS = $(filter build/results_%,$(BENCHES))
 TESTS = $(patsubst tests/%.c,$(TEST_DIR)/%,$(wildcard tests/test_*.c))
 
 # Programs use all cores where the compiler can; the tests do not, so that the plain path is what is tested.
@@ -76,6 +79,13 @@ demo: build/fit_depth
 bench: $(BENCHES)
 	@$(BENCH_COMMAND)
 
+results: $(RESULTS)
+	@sh bench/results.sh bench/results $(RESULTS)
+	@sh bench/readme.sh
+
+results-quick: $(RESULTS)
+	@sh bench/results.sh --quick build/results $(RESULTS)
+
 test-programs: $(TESTS)
 
 # Two at a time, whatever -j says; a program that does not build is counted as failed by the runner.
@@ -100,4 +110,4 @@ matrix-quick:
 clean:
 	rm -rf build
 
-.PHONY: all demo test test-programs torture matrix matrix-quick bench clean
+.PHONY: all demo test test-programs torture matrix matrix-quick bench results results-quick clean

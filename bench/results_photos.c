@@ -175,8 +175,8 @@ static void write_section(const results *r, int count, const job *jobs, int nois
         summary b = summary_of(count, jobs, "table", families[k], 0, 1);
         if (!a.count) { continue; }
         fprintf(md, "| %ss | %.1f | %.2f (%.2f) | %d of %d | %.1f | %.2f (%.2f) | %d of %d | %.1f | %s |\n",
-                families[k], a.start, a.end, a.worst, a.good, a.count, a.seconds, b.end, b.worst, b.good, b.count, b.seconds,
-                published[k]);
+                families[k], a.start, a.end, a.worst, a.good, a.count, a.seconds, b.end, b.worst, b.good, b.count,
+                b.seconds, published[k]);
     }
     fprintf(md, "\nRobustness, cars: the start is the true code with noise (in root mean squares of the decoder's "
                 "codes), or random with photos of another focal length, which the fit knows.\n\n"

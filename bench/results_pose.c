@@ -1,12 +1,13 @@
 /* SPDX-License-Identifier: MIT-0
    results_pose.c - a known shape and one depth image, the camera looked for, from more and more far away: error against
    iteration, and how many are found. The paper shows one aeroplane in a figure, without a number. The fits are those of
-   examples/fit_pose.c on shapes of the embedded decoder: Adam alone, by the paper's tracer and gradient or by ours; it
-   with the steps of Gauss and Newton after it; and that with new tries where the picture is not explained. */
+   examples/fit_pose.c on shapes of the embedded decoder: Adam alone, by the paper's tracer and gradient or by ours;
+   then with the steps of Gauss and Newton after it; and that with new tries where the picture is not explained. */
 #define main fit_pose_main
 int fit_pose_main(int argc, char **argv);
 #include "../examples/fit_pose.c"
 #undef main
+#include "plot.h"
 #include "results.h"
 
 static const char results_usage[] =
@@ -128,60 +129,47 @@ static summary summary_of(int count, const job *jobs, float degrees, int way)
     return s;
 }
 
-static void plot_success(const results *r, int count, const job *jobs, int levels, const float *starts)
+/* Error over the steps, median and quarters of the starts that are `degrees` off; the share found over the offset. */
+static void write_ways(const results *r, int count, const job *jobs, int levels, const float *starts, float degrees,
+                       int steps)
 {
-    double x[16], y[WAYS][16];
-    curve curves[WAYS];
-    char path[PATH_SIZE];
-    for (int w = 0; w < WAYS; w++) {
-        for (int i = 0; i < levels; i++) {
-            summary s = summary_of(count, jobs, starts[i], w);
-            x[i] = (double)starts[i];
-            y[w][i] = 100.0 * s.explained / s.count;
-        }
-        curves[w].name = way_names[w];
-        curves[w].n = (size_t)levels;
-        curves[w].x = x;
-        curves[w].y = y[w];
-    }
-    write_curves(path_of(path, results_stem(r, "pose_success"), ".svg"), "cameras found", "degrees off at the start",
-                 "percent", WAYS, curves, 0);
-    puts(path);
-}
-
-/* Median and quarters of the starts that are `degrees` off, over the steps. */
-static void write_ways(const results *r, int count, const job *jobs, float degrees, int steps)
-{
-    static const char *const names[2] = {"paper", "dist.h"};
-    static const double shares[3] = {0.25, 0.5, 0.75};
-    double *y = (double *)take(6 * MOST_STEPS, sizeof *y);
+    static const char *const names[2] = {"paper, Adam", "and Gauss-Newton"};
     double values[MOST_JOBS];
-    curve curves[2];
-    char path[PATH_SIZE];
+    char path[PATH_SIZE], title[64];
+    plot p = plot_begin("Cameras from one depth image", "shapes of the embedded decoder", 2);
     FILE *csv = results_csv(r, "pose_curve", "method,degrees_start,step,degrees_quarter,degrees_median,"
                                              "degrees_three_quarters");
+    snprintf(title, sizeof title, "starts %g degrees off", (double)degrees);
+    plot_panel *a = plot_add_panel(&p, title, "step", "degrees off, median", PLOT_LOG_Y);
+    a->least[1] = 1e-6;
     for (int m = 0; m < 2; m++) {
+        plot_series *s = plot_add_series(a, names[m]);
         for (int i = 0; i <= steps; i++) {
             size_t n = 0;
             for (int k = 0; k < count; k++) {
                 if (fabsf(jobs[k].degrees - degrees) <= 1e-6f) { values[n++] = jobs[k].way[m][i]; }
             }
             double middle = results_median(n, values);
-            double low = values[(size_t)(shares[0] * (double)(n - 1) + 0.5)];
-            double high = values[(size_t)(shares[2] * (double)(n - 1) + 0.5)];
-            y[m * MOST_STEPS + i] = fmax(middle, 1e-6);
-            fprintf(csv, "%s,%g,%d,%.3e,%.3e,%.3e\n", names[m], (double)degrees, i, low, middle, high);
+            double low = values[(size_t)(0.25 * (double)(n - 1) + 0.5)];
+            double high = values[(size_t)(0.75 * (double)(n - 1) + 0.5)];
+            fprintf(csv, "\"%s\",%g,%d,%.3e,%.3e,%.3e\n", names[m], (double)degrees, i, low, middle, high);
+            plot_point *q = plot_add(s, i, middle);
+            q->size = 0.5;
+            if (i % 10 == 5 * m) { q->y_low = low, q->y_high = high; }
         }
-        curves[m].name = names[m];
-        curves[m].n = (size_t)steps + 1;
-        curves[m].x = NULL;
-        curves[m].y = y + m * MOST_STEPS;
     }
     results_close(r, csv, "pose_curve", ".csv");
-    write_curves(path_of(path, results_stem(r, "pose_curve"), ".svg"), "the camera's way", "step",
-                 "degrees off, median", 2, curves, 1);
+    a = plot_add_panel(&p, "found", "degrees off at the start", "percent", PLOT_ZERO_Y);
+    for (int w = 0; w < WAYS; w++) {
+        plot_series *s = plot_add_series(a, way_names[w]);
+        for (int i = 0; i < levels; i++) {
+            summary found = summary_of(count, jobs, starts[i], w);
+            plot_add(s, (double)starts[i], 100.0 * found.explained / found.count);
+        }
+    }
+    p.notes[0] = "bars: from the first to the third quarter";
+    plot_write(&p, path_of(path, results_stem(r, "pose"), ".svg"), results_machine());
     puts(path);
-    free(y);
 }
 
 static void write_tables(const results *r, int count, const job *jobs, int levels, const float *starts)
@@ -212,7 +200,7 @@ static void write_tables(const results *r, int count, const job *jobs, int level
         }
         fputc('\n', md);
     }
-    fputs("\n![found](pose_success.svg) ![error](pose_curve.svg)\n", md);
+    fputs("\n[pose_curve.csv](pose_curve.csv)\n\n![error over steps, and share found](pose.svg)\n", md);
     results_close(r, md, "pose", ".md");
 }
 
@@ -248,8 +236,7 @@ int main(int argc, char **argv)
     }
     run_jobs(net, &base, levels * trials, jobs);
     write_tables(&r, levels * trials, jobs, levels, starts);
-    plot_success(&r, levels * trials, jobs, levels, starts);
-    write_ways(&r, levels * trials, jobs, starts[r.quick ? 1 : 2], base.fit.iterations + base.refine);
+    write_ways(&r, levels * trials, jobs, levels, starts, starts[r.quick ? 1 : 2], base.fit.iterations + base.refine);
     free(jobs);
     dist_net_destroy(net);
     dist_context_destroy(ctx);

@@ -8988,6 +8988,7 @@ typedef struct disti_render_job {
     int least;   /* misses need their smallest f: for the silhouette or the relaxed boundary */
     int warm;    /* and from what the tape's picture found */
     float step;  /* three pixels' width at the field's center */
+    float change; /* mean change of f at the tape's hits */
     size_t first[DISTI_LIST_TASKS + 1]; /* disti_render_list: first pixel of each task */
     size_t each;                        /* and how many of them each has */
     int count;                          /* tasks */
@@ -9242,10 +9243,9 @@ typedef struct disti_warm {
     const disti_tile *tile;
     const disti_bench *bench;
     int worker, n, silhouette;
-    int known;            /* whether anything is known of the change */
     float *moved;         /* of each pixel: how far its hit has moved; 3e38: not known */
     unsigned char *open;  /* 1: not decided by the cones; 2: and its hit was not where it was looked for */
-    float change;         /* largest change of f */
+    float change;         /* largest change of f, no less than its mean over the picture */
     size_t count;         /* of bench->index */
 } disti_warm;
 
@@ -9283,7 +9283,6 @@ static int disti_warm_expects(const disti_warm *warm, int i, float s)
 static void disti_warm_change(disti_warm *warm, float change)
 {
     warm->change = DISTI_MAX(warm->change, change < 0.0f ? -change : change);
-    warm->known = 1;
 }
 
 static void disti_warm_again(disti_warm *warm, int i)
@@ -9294,6 +9293,7 @@ static void disti_warm_again(disti_warm *warm, int i)
     ray->best = ray->q = ray->start;
     ray->fbest = 3e38f;
     ray->fb = ray->slope = ray->error = 0.0f;
+    ray->steps = 0;
     ray->kept = 0;
     warm->moved[i] = 3e38f;
     warm->open[i] = 2;
@@ -9444,55 +9444,92 @@ static int disti_warm_minimum_due(const disti_warm *warm, int i)
     return ((unsigned)(x / 4 * 5 + y / 4 * 3) + warm->tape->turn) % DISTI_WARM_MINIMA == 0;
 }
 
-/* Near misses, the first `count` of bench->index: downhill, in strides that double, until f is more on both sides, and
-   the least of the parabola there. A ray is a miss if f is more than the largest change even there. */
+/* One sample f at ray->q of a ray that passes close by a surface; ray->s, f: the lowest one so far. Samples on both
+   sides, in strides that double, until both are higher, and then in narrower ones around where the parabola through the
+   three is lowest, until it is known how low that is. 0: it is more than `least`; below 0: the crossing is bracketed.
+   1: another query; -1: undecided. */
+static int disti_warm_pass(const disti_warm *warm, disti_ray *ray, float f, float least)
+{
+    ray->steps++;
+    if (f <= 0.0f) { /* back to a positive sample and into the bracket */
+        ray->b = ray->q;
+        ray->fb = f;
+        ray->width = DISTI_MAX(1.5f * -f / warm->tracer->lipschitz, 0.25f * ray->width);
+        return disti_ray_ask(ray, DISTI_BACK, DISTI_MAX(ray->q - ray->width, ray->enter));
+    }
+    if (ray->side == 0) { /* the other side */
+        ray->side = 1;
+        ray->fa = f;
+        return disti_ray_ask(ray, DISTI_WAIT, DISTI_MIN(ray->s + ray->width, ray->leave));
+    }
+    if (ray->side == 1 && ray->fa >= ray->f && f >= ray->f) {
+        float curvature = ray->fa - 2.0f * ray->f + f, rise = DISTI_MAX(ray->fa, f) - ray->f;
+        float drop = curvature > 0.0f ? (ray->fa - f) * (ray->fa - f) / (8.0f * curvature) : 0.0f;
+        float q = ray->s + disti_parabola(ray->width, ray->fa, ray->f, f);
+        if (ray->f - drop - 0.25f * rise > DISTI_MAX(least, ray->moved ? 0.0f : 0.5f * ray->f)) {
+            ray->s = q;
+            ray->f -= drop;
+            return 0;
+        }
+        ray->side = 2;
+        return disti_ray_ask(ray, DISTI_WAIT, q);
+    }
+    if (ray->side == 2) {
+        if (f < ray->f) ray->s = ray->q;
+        ray->f = DISTI_MIN(ray->f, f);
+        ray->width *= 0.25f;
+        if (ray->width < 0.25f * least) return ray->f > least ? 0 : -1;
+    } else {
+        ray->s += ray->fa < f ? -ray->width : ray->width;
+        ray->f = DISTI_MIN(ray->fa, f);
+        ray->width *= 2.0f;
+    }
+    ray->side = 0;
+    if (ray->steps > 24 || ray->s <= ray->enter || ray->s >= ray->leave) return -1;
+    return disti_ray_ask(ray, DISTI_WAIT, ray->s - ray->width);
+}
+
+/* The first `count` rays of bench->index pass close by a surface or run into it: from ray->s, f on. Those with
+   ray->moved have another end already, which stands if they pass. */
 static void disti_warm_near(disti_warm *warm, size_t count)
 {
     const disti_bench *bench = warm->bench;
-    for (size_t k = 0; k < count; k++) {
-        disti_ray *ray = &bench->rays[bench->index[k]];
-        ray->width = DISTI_MAX(0.5f * ray->fbest, 2e-3f * warm->tracer->field->radius);
-    }
-    for (int round = 0; round < 15 && count > 0; round++) {
-        int phase = round % 3;
+    size_t asked = 0;
+    for (int round = 0; count > 0; round++) {
         size_t kept = 0;
         for (size_t k = 0; k < count; k++) {
-            disti_ray *ray = &bench->rays[bench->index[k]];
-            if (phase == 0) {
-                ray->a = ray->best;
-                ray->fa = ray->fbest;
-            }
-            float ds = phase == 0   ? -ray->width
-                       : phase == 1 ? ray->width
-                                    : disti_parabola(ray->width, ray->b, ray->fa, ray->fb);
-            ray->q = DISTI_MIN(DISTI_MAX(ray->a + ds, ray->enter), ray->leave);
-            disti_ray_point(ray, ray->q, bench->points + 3 * k);
-        }
-        size_t asked = disti_query(warm->tracer, warm->worker, bench, count);
-        bench->stats->refine_queries += asked;
-        for (size_t k = 0; k < count; k++) {
-            int i = bench->index[k];
+            int i = bench->index[k], more;
             disti_ray *ray = &bench->rays[i];
-            float f = k < asked && disti_finite(bench->sdf[k]) ? bench->sdf[k] : -1.0f;
-            if (phase == 0) ray->b = f;
-            if (phase == 1) ray->fb = f;
-            if (f < ray->fbest) {
-                ray->best = ray->q;
-                ray->fbest = f;
-            }
-            float least = warm->change + 2.0f * disti_ray_epsilon(warm->tracer, ray, ray->best);
-            int lowest = ray->fa <= ray->b && ray->fa <= ray->fb;
-            if (ray->fbest <= least || (phase == 2 && round == 14 && !lowest)) {
-                disti_warm_again(warm, i);
-            } else if (phase == 2 && lowest) {
-                disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest, 0.0f);
-                ray->kept = 1;
+            float f = round == 0 ? ray->f : bench->sdf[k];
+            float least = 2.0f * disti_ray_epsilon(warm->tracer, ray, ray->s);
+            if (round == 0) {
+                ray->width = DISTI_MAX(0.5f * f, 2e-3f * warm->tracer->field->radius);
+                ray->side = 0;
+                ray->steps = 0;
+                ray->q = ray->s;
+                more = f <= 0.0f ? disti_warm_pass(warm, ray, f, least)
+                                 : disti_ray_ask(ray, DISTI_WAIT, DISTI_MAX(ray->s - ray->width, ray->enter));
+            } else if (k >= asked || !disti_finite(f)) {
+                more = -1;
+            } else if (ray->mode == DISTI_WAIT) {
+                more = disti_warm_pass(warm, ray, f, least);
             } else {
-                if (phase == 2) ray->width *= 2.0f;
-                bench->index[kept++] = i;
+                more = disti_ray_advance(warm->tracer, ray, f);
             }
+            if (more > 0) {
+                bench->index[kept] = i;
+                disti_ray_point(ray, ray->q, bench->points + 3 * kept++);
+                continue;
+            }
+            if (more < 0) disti_warm_again(warm, i);
+            else if (ray->mode != DISTI_WAIT) warm->moved[i] = 3e38f;
+            else if (ray->moved) ray->mode = DISTI_DONE;
+            else disti_ray_end(ray, DIST_RAY_MISS, ray->s, ray->f, 0.0f);
+            ray->kept = more == 0;
         }
         count = kept;
+        asked = disti_query(warm->tracer, warm->worker, bench, count);
+        bench->stats->refine_queries += asked;
     }
 }
 
@@ -9502,7 +9539,7 @@ static void disti_warm_misses(disti_warm *warm)
 {
     const disti_bench *bench = warm->bench;
     const dist_field *field = warm->tracer->field;
-    float clamp = field->clamp > 0.0f ? field->clamp : 0.1f * field->radius;
+    float clamp = field->clamp > 0.0f ? field->clamp : 0.1f * field->radius, loss = warm->change;
     size_t count = 0, near = 0;
     for (int i = 0; i < warm->n; i++) {
         size_t pixel = disti_warm_pixel(warm, i);
@@ -9511,21 +9548,20 @@ static void disti_warm_misses(disti_warm *warm)
         int blocked = warm->open[i] && ray->mode != DISTI_DONE;
         if (warm->tape->status[pixel] != ((int)DIST_RAY_MISS | DISTI_TAPE_SAMPLE)) continue;
         if (!blocked && (warm->open[i] || ray->status != DIST_RAY_MISS || !(ray->enter < ray->leave))) continue;
-        float f = warm->tape->value[pixel], loss = 1.5f * warm->change;
+        float f = warm->tape->value[pixel], epsilon = disti_ray_epsilon(warm->tracer, ray, ray->start);
         /* the cones went through here: nothing is known of a ray that they do not clear any more */
         if (blocked && !(f > 0.0f) && warm->tape->start[pixel] <= ray->enter) continue;
-        float aside = blocked ? warm->tape->nearest[pixel] : 3e38f;
-        float epsilon = disti_ray_epsilon(warm->tracer, ray, ray->start);
         if (blocked && (ray->guard > 2e38f || !disti_warm_reaches(warm, i) ||
             disti_warm_due(warm, i, DISTI_WARM_MISSES)))
             continue;
         int due = disti_warm_minimum_due(warm, i);
         if (!blocked && warm->silhouette && due) continue;
-        float lower = warm->silhouette ? f - 8.0f * loss : f - loss;
-        int ask = blocked && (!warm->known || lower < 8.0f * warm->change + 4.0f * epsilon || aside < 2e38f);
+        float lower = warm->silhouette ? f - 12.0f * loss : f - loss;
+        int ask = blocked && lower < 3.0f * (warm->change + epsilon);
         if (warm->silhouette && f < 0.98f * clamp) ask |= f < 0.2f * clamp || due ||
             ((x ^ y) + warm->tape->turn) % 4u == 0;
-        ray->best = aside < 2e38f ? aside : warm->tape->s[pixel];
+        ray->best = warm->tape->s[pixel];
+        ray->moved = 0;
         if (ask) {
             disti_ray_point(ray, ray->best, bench->points + 3 * count);
             bench->index[count++] = i;
@@ -9537,40 +9573,43 @@ static void disti_warm_misses(disti_warm *warm)
     count = disti_query(warm->tracer, warm->worker, bench, count);
     *(warm->silhouette ? &bench->stats->silhouette_queries : &bench->stats->refine_queries) += count;
     for (size_t k = 0; k < count; k++) {
-        size_t pixel = disti_warm_pixel(warm, bench->index[k]);
-        float change = warm->tape->value[pixel] - bench->sdf[k]; /* value may have been lowered: only a fall tells */
-        int measured = warm->tape->value[pixel] > 0.0f && warm->tape->nearest[pixel] > 2e38f;
-        if (disti_finite(change) && measured && (change > 0.0f || !warm->known)) disti_warm_change(warm, change);
+        float value = warm->tape->value[disti_warm_pixel(warm, bench->index[k])]; /* 0: not measured */
+        if (value > bench->sdf[k]) warm->change = DISTI_MAX(warm->change, value - bench->sdf[k]);
     }
     for (size_t k = 0; k < count; k++) {
-        disti_ray *ray = &bench->rays[bench->index[k]];
+        int i = bench->index[k];
+        disti_ray *ray = &bench->rays[i];
         float f = bench->sdf[k], epsilon = disti_ray_epsilon(warm->tracer, ray, ray->best);
-        size_t pixel = disti_warm_pixel(warm, bench->index[k]);
-        int measured = warm->tape->value[pixel] > 0.0f && warm->tape->nearest[pixel] > 2e38f;
-        ray->fbest = f;
-        if (f > (measured ? 0.0f : 0.03f * field->radius) + 5.0f * (warm->change + epsilon)) {
-            disti_ray_end(ray, DIST_RAY_MISS, ray->best, f, 0.0f);
-            ray->kept = !warm->silhouette || !disti_warm_minimum_due(warm, bench->index[k]);
-        } else if (f > 0.0f) {
-            bench->index[near++] = bench->index[k];
+        float margin = 3.0f * (warm->change + epsilon);
+        if (!(warm->tape->value[disti_warm_pixel(warm, i)] > 0.0f)) margin += 0.03f * field->radius;
+        ray->fbest = ray->f = f;
+        ray->s = ray->best;
+        if (f > margin) {
+            disti_ray_end(ray, DIST_RAY_MISS, ray->best, warm->silhouette ? f : 0.5f * f, 0.0f);
+            ray->kept = !warm->silhouette || !disti_warm_minimum_due(warm, i);
+        } else if (f > 0.0f || warm->open[i]) {
+            bench->index[near++] = i;
         }
     }
     disti_warm_near(warm, near);
 }
 
-/* Hits beside nearer ones: spheres from the nearer one's distance on until f rises again or is what the hit alone
-   makes it. Those that may be covered are marched anew. */
-static void disti_warm_covered(disti_warm *warm)
+/* What lies beside another surface, hits that have a nearer one beside them and misses, may be covered by that: spheres
+   from its distance on until f rises again or is what the hit alone makes it; what they get close to is looked at. */
+static void disti_warm_beside(disti_warm *warm)
 {
     const disti_bench *bench = warm->bench;
-    size_t count = 0, again = 0;
-    int *redo = (int *)(void *)(warm->open + 2 * DISTI_TILE * DISTI_TILE);
+    size_t count = 0, close = 0;
+    int *near = (int *)(void *)(warm->open + 2 * DISTI_TILE * DISTI_TILE);
     for (int i = 0; i < warm->n; i++) {
         disti_ray *ray = &bench->rays[i];
         float s = warm->tape->nearest[disti_warm_pixel(warm, i)];
-        if (warm->moved[i] > 2e38f || s <= ray->start || s >= ray->best) continue;
+        int hit = warm->moved[i] < 2e38f && s < ray->best, miss = ray->status == DIST_RAY_MISS && ray->kept;
+        miss &= (i % warm->tile->width + i / warm->tile->width + (int)(warm->tape->turn & 1u)) & 1;
+        if (!warm->open[i] || ray->mode != DISTI_DONE || !(hit || miss) || s <= ray->start || s >= ray->leave) continue;
         ray->q = s;
         ray->f = 3e38f;
+        ray->moved = 1;
         bench->index[count++] = i;
     }
     for (int round = 0; count > 0; round++) {
@@ -9582,17 +9621,19 @@ static void disti_warm_covered(disti_warm *warm)
         for (size_t k = 0; k < count; k++) {
             disti_ray *ray = &bench->rays[bench->index[k]];
             float f = k < asked ? bench->sdf[k] : 0.0f, epsilon = disti_ray_epsilon(warm->tracer, ray, ray->q);
-            float step = f / warm->tracer->lipschitz;
-            if (!(f > warm->change + 2.0f * epsilon) || round > 16) redo[again++] = bench->index[k];
-            else if (f < ray->f && f < -0.7f * ray->slope * (ray->best - ray->q))
+            int hit = ray->status == DIST_RAY_HIT;
+            float away = hit ? 2.0f * (warm->change + epsilon) : 0.03f * warm->tracer->field->radius;
+            if (!(f > away) || round > 16) near[close++] = bench->index[k];
+            else if (hit && f < ray->f && f < -0.7f * ray->slope * (ray->best - ray->q))
                 bench->index[kept++] = bench->index[k];
             ray->f = f;
-            ray->q += step;
+            ray->s = ray->q;
+            ray->q += f / warm->tracer->lipschitz;
         }
         count = kept;
     }
-    for (size_t k = 0; k < again; k++) disti_warm_again(warm, bench->index[k] = redo[k]);
-    disti_trace_rounds(warm->tracer, warm->worker, bench, again);
+    for (size_t k = 0; k < close; k++) bench->index[k] = near[k];
+    disti_warm_near(warm, close);
 }
 
 /* Marches the hits whose turn it is. 0: one of them is nearer than expected. */
@@ -9629,6 +9670,7 @@ static void disti_render_warm(const disti_render_job *job, int worker, const dis
     warm.worker = worker;
     warm.n = tile->width * tile->height;
     warm.silhouette = job->least;
+    warm.change = job->change;
     warm.moved = (float *)(void *)bench->rest;
     warm.open = bench->rest + (size_t)warm.n * sizeof(float);
     for (int i = 0; i < warm.n; i++) {
@@ -9638,7 +9680,7 @@ static void disti_render_warm(const disti_render_job *job, int worker, const dis
     int good = disti_warm_hits(&warm);
     if (good) {
         disti_warm_misses(&warm);
-        disti_warm_covered(&warm);
+        disti_warm_beside(&warm);
         good = disti_warm_refresh(&warm);
     }
     for (int i = 0; i < warm.n && !good; i++)
@@ -9671,9 +9713,9 @@ static void disti_warm_seed(const disti_tile *tile, const disti_bench *bench)
             bench->rays[i].fbest = 0.0f;
 }
 
-/* What disti_warm_covered asks: for each hit the s of the nearest hit among its eight neighbors, if that is more than
-   three pixels nearer and the neighbor across is not as much farther; for each miss that of the hit beside it, if that
-   is more than three pixels away from its own place; 3e38: none. */
+/* What disti_warm_beside asks: for each hit the s of the nearest hit among its eight neighbors, if that is more than
+   three pixels nearer and the neighbor across is not as much farther; for each miss likewise, else that of the hit
+   beside it, if that is more than three pixels away from its own place; 3e38: none. */
 static void disti_nearest_task(void *arg, int index, int worker)
 {
     const disti_render_job *job = (const disti_render_job *)arg;
@@ -9687,7 +9729,7 @@ static void disti_nearest_task(void *arg, int index, int worker)
             float s = tape->s[pixel], nearest = 3e38f;
             int hit = tape->status[pixel] & DISTI_TAPE_HIT,
                 none = tape->status[pixel] != ((int)DIST_RAY_MISS | DISTI_TAPE_SAMPLE);
-            float closest = 3e38f;
+            float closest = 3e38f, front = 3e38f;
             for (int k = 0; k < 8 && (hit || !none); k++) {
                 int side = k & 1 ? -1 : 1, ox = dx[k / 2] * side, oy = dy[k / 2] * side;
                 if (x + ox < 0 || x + ox >= tape->width || y + oy < 0 || y + oy >= tape->height) continue;
@@ -9696,6 +9738,7 @@ static void disti_nearest_task(void *arg, int index, int worker)
                 if (!(tape->status[other] & DISTI_TAPE_HIT)) continue;
                 if (!hit) {
                     float off = ahead < 0.0f ? -ahead : ahead;
+                    if (ahead > job->step) front = DISTI_MIN(front, tape->s[other]);
                     if (off < closest) nearest = off > job->step ? tape->s[other] : 3e38f;
                     closest = DISTI_MIN(closest, off);
                     continue;
@@ -9707,7 +9750,7 @@ static void disti_nearest_task(void *arg, int index, int worker)
                     tape->s[across] - s > 0.3f * ahead;
                 if (!steep) nearest = DISTI_MIN(nearest, tape->s[other]);
             }
-            tape->nearest[pixel] = nearest;
+            tape->nearest[pixel] = front < 2e38f ? front : nearest;
         }
     }
 }
@@ -9858,9 +9901,8 @@ static int disti_render_predicts(const disti_tracer *tracer, const disti_view *v
     return disti_view_away(view, tracer->field) < 0.01 * (double)tracer->field->radius * f;
 }
 
-/* Whether the surface is still about where the tape has it: f at up to 1024 of its hits, evenly over the picture, is
-   less than 4e-3 radii in the mean. */
-static int disti_render_near(const disti_tracer *tracer, const disti_view *view, dist_tape *tape)
+/* Mean |f| at up to 1024 of the tape's hits, evenly over the picture: how much has changed. 3e38: it has none. */
+static float disti_render_change(const disti_tracer *tracer, const disti_view *view, dist_tape *tape)
 {
     enum { SIDE = 32 };
     int dx = (view->width + SIDE - 1) / SIDE, dy = (view->height + SIDE - 1) / SIDE;
@@ -9881,7 +9923,7 @@ static int disti_render_near(const disti_tracer *tracer, const disti_view *view,
     bench.stats->queries += count;
     bench.stats->refine_queries += count;
     for (size_t i = 0; i < count; i++) sum += fabs((double)tape->d_sdf[i]);
-    return count > 0 && sum <= 4e-3 * (double)tracer->field->radius * (double)count;
+    return count > 0 && disti_finite_double(sum) ? (float)(sum / (double)count) : 3e38f;
 }
 
 DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, const dist_camera *camera,
@@ -9928,7 +9970,8 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     disti_sphere_box(&view, field, job.box);
     job.warm = tracer.how.warm_start && !listed && disti_render_warms(&tracer, camera, tape);
     job.step = (float)(6.0 * disti_view_footprint(&view, 1.0) * disti_view_away(&view, field));
-    if (job.warm) job.warm = disti_render_near(&tracer, &view, tape);
+    job.change = job.warm ? disti_render_change(&tracer, &view, tape) : 0.0f;
+    if (!(job.change <= 4e-3f * field->radius)) job.warm = 0;
     if (job.warm) disti_run(ctx, (view.height + DISTI_TILE - 1) / DISTI_TILE, disti_nearest_task, &job);
     disti_run(ctx, job.count, listed ? disti_render_list_task : disti_render_task, &job);
     disti_stats_end(ctx, &tracer, out->stats);

@@ -33,6 +33,7 @@
        DIST_NO_BACKWARD       no gradients (implies DIST_NO_TRAIN)
        DIST_NO_TRAIN          no weight gradients, no dist_net_create, no Adam
        DIST_NO_MESH           no isosurface, no Chamfer
+       DIST_NO_HALF           no 16-bit kernels: dist_net_set_half refuses
        DIST_NO_PAPER          no DIST_TRACE_PAPER
 
    Conventions: world to camera x_cam = R x + t, x right, y down, z forward; pixel centers at integers unless the camera
@@ -204,6 +205,10 @@ typedef struct dist_field {
        dL/dweights of the net that gives the color. */
     void (*color_weights_fn)(void *user, dist_context *ctx, size_t n, const float *points, const float *d_color,
                              float *d_points, double *d_code, float *d_weights);
+    /* A cheaper eval_fn, off by about coarse_error at most, with the same arguments: field.eval_fn = field.coarse_fn takes
+       it for everything; gradients are the exact ones. Set by dist_shape_field after dist_net_set_half. */
+    void (*coarse_fn)(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient);
+    float coarse_error;
     float center[3]; /* bounding sphere: the surface lies inside it, nothing is looked for outside */
     float radius;
     float lipschitz;     /* bound or estimate of |grad f| where 0 < f < clamp / 2 (no clamp: radius / 20); 0: 1 */
@@ -340,6 +345,22 @@ DIST_API void dist_net_destroy(dist_net *net);
    NULL nothing else happens; too small a capacity is refused. Weight norm is folded: plain weights are written, in
       F32. */
 DIST_API dist_status dist_net_save(dist_context *ctx, const dist_net *net, void *buffer, size_t capacity, size_t *size);
+
+enum {
+    DIST_HALF_OFF = 0,
+    DIST_HALF_AUTO, /* F16 where the processor has it and the weights fit, else BF16 */
+    DIST_HALF_F16,  /* AVX512-FP16: 11 bits of mantissa, up to 65504 */
+    DIST_HALF_BF16  /* AVX512-BF16: 8 bits */
+};
+/* Packs the hidden layers' weights once more, in 16 bits: F16 at the size of the f32 ones, BF16 at half of it. Shapes
+   made afterwards have field.coarse_fn, and as field.coarse_error the largest difference to f32 met at 768 points of the
+   bounding sphere when the shape is made: a sample, not a proof. The point's columns and the last layer stay in f32; a
+   block in which anything overflows is evaluated in f32. DIST_UNSUPPORTED: a processor or build without these
+   instructions, LayerNorm, weights beyond 65504 in F16 (set later, they turn it off). Shapes on contexts of another isa
+   than DIST_ISA_AVX512 have no coarse_fn. No shape of the net may be in use by another thread. */
+DIST_API dist_status dist_net_set_half(dist_context *ctx, dist_net *net, int kind);
+/* What is in force: DIST_HALF_OFF, F16 or BF16. */
+DIST_API int dist_net_half(const dist_net *net);
 
 DIST_API int dist_net_code_size(const dist_net *net);  /* 0: no code */
 DIST_API int dist_net_code_count(const dist_net *net); /* codes stored in the file */
@@ -818,6 +839,11 @@ extern "C" {
 #include <intrin.h>
 #endif
 #endif
+/* Older compilers do not know the 16-bit instructions. */
+#if defined(DISTI_X86) && !defined(DIST_NO_HALF) &&                                                                    \
+    ((defined(__clang__) && __clang_major__ >= 14) || (!defined(__clang__) && defined(__GNUC__) && __GNUC__ >= 12))
+#define DISTI_HALF
+#endif
 #if !defined(DIST_NO_SIMD) && (defined(__aarch64__) || defined(_M_ARM64))
 #define DISTI_NEON
 #include <arm_neon.h>
@@ -1051,14 +1077,14 @@ static void disti_free(dist_context *ctx, void *p, size_t bytes)
 
 #ifdef DISTI_X86
 /* r: eax, ebx, ecx, edx */
-static void disti_cpuid(unsigned leaf, unsigned r[4])
+static void disti_cpuid(unsigned leaf, unsigned sub, unsigned r[4])
 {
 #ifdef _MSC_VER
     int v[4];
-    __cpuidex(v, (int)leaf, 0);
+    __cpuidex(v, (int)leaf, (int)sub);
     for (int i = 0; i < 4; i++) r[i] = (unsigned)v[i];
 #else
-    __asm__ volatile("cpuid" : "=a"(r[0]), "=b"(r[1]), "=c"(r[2]), "=d"(r[3]) : "a"(leaf), "c"(0u));
+    __asm__ volatile("cpuid" : "=a"(r[0]), "=b"(r[1]), "=c"(r[2]), "=d"(r[3]) : "a"(leaf), "c"(sub));
 #endif
 }
 
@@ -1091,16 +1117,32 @@ static int disti_cpu_has(int isa)
         const unsigned features = isa == DIST_ISA_AVX2 ? avx2 : avx512;
         const unsigned state = isa == DIST_ISA_AVX2 ? 0x06u : 0xe6u;
         unsigned r[4];
-        disti_cpuid(0, r);
+        disti_cpuid(0, 0, r);
         if (r[0] < 7) return 0;
-        disti_cpuid(1, r);
+        disti_cpuid(1, 0, r);
         if ((r[2] & fma_osxsave_avx) != fma_osxsave_avx) return 0; /* without OSXSAVE xgetbv itself would fault */
         if ((disti_xgetbv() & state) != state) return 0;
-        disti_cpuid(7, r);
+        disti_cpuid(7, 0, r);
         return (r[1] & features) == features;
     }
 #endif
     return 0;
+}
+
+/* Whether this processor and this build compute in DIST_HALF_F16 or DIST_HALF_BF16. */
+static int disti_cpu_half(int kind)
+{
+#ifdef DISTI_HALF
+    unsigned r[4];
+    if (!disti_cpu_has(DIST_ISA_AVX512)) return 0;
+    disti_cpuid(7, 0, r);
+    if (kind == DIST_HALF_F16) return (int)(r[3] >> 23 & 1);
+    if (r[0] < 1) return 0;
+    disti_cpuid(7, 1, r);
+    return kind == DIST_HALF_BF16 && (r[0] >> 5 & 1);
+#else
+    return (void)kind, 0;
+#endif
 }
 
 static int disti_cpu_best(void)
@@ -2243,6 +2285,194 @@ DISTI_KERNELS(avx2, 4, 3)
 #define DISTI_KEEP(v, bits) _mm512_maskz_mov_ps((__mmask16)((bits) & 0xffff), v)
 #define DISTI_DEPTH 512
 DISTI_KERNELS(avx512, 8, 3)
+
+#ifdef DISTI_HALF
+/* A hidden layer in 16 bits: f16 by AVX512-FP16, or pairs of inputs by AVX512-BF16, from one text as above. A vector's
+   32-bit lanes hold two points of one row (f16) or one point's values in two rows (bf16), so a step is a row or a pair,
+   its 192 bytes carry 96 points or 48, and its factors are a weight twice or the weights of the pair: 32 bits that
+   broadcast without a shuffle. f32 sums begin with the bias and the point's columns, which stay in f32; f16 adds to
+   them after every DISTI_SHORT steps, dead ones included, so its roundings do not pile up and leaving out what is zero
+   for the whole block changes no bit.
+   forward   y = activation(bias + sum_j point_weights(o, j) points[j] + sum_k weights(o, k) x[k])     k alive
+   Steps of y that are not zero everywhere are appended to y_alive. bad: a sum was not finite. */
+typedef struct disti_half {
+    const float *weights;    /* panels (out / 8, steps, 8) of 32 bits */
+    const float *point_weights, *bias; /* point_weights: of the first panel, (point, 8) */
+    const float *points[2];  /* (point, B) of the first and second 48 columns */
+    const float *x;          /* (steps, B) of 32 bits */
+    const int *alive;        /* NULL: all steps */
+    float *y;                /* (steps, B) of 32 bits */
+    float *last[2];          /* instead of y, unless NULL: (out, B) in f32, the first and second 48 columns */
+    int *y_alive;
+    void (*activate)(int activation, float scale, size_t n, float *y, float *slope); /* NULL: ReLU */
+    float scale;
+    size_t panel;            /* floats from one panel of point_weights to the next */
+    int activation, steps, alive_count, point, out, columns, y_alive_count, bad;
+} disti_half;
+
+#define DISTI_CELL(c) ((c) / DISTI_BLOCK)
+#define DISTI_FLUSH(i, V) DISTI_X##V(DISTI_FLUSH1, i)
+#define DISTI_HALF_TILE(name, V)                                                                                       \
+    DISTI_NOINLINE DISTI_FUNCTION void disti_half_##name(disti_half *g, int o)                                         \
+    {                                                                                                                  \
+        float sums[8 * DISTI_COLUMNS];                                                                                 \
+        const size_t n = DISTI_WIDEN * V * 16, at = (size_t)(unsigned)o;                                               \
+        const int *alive = g->alive, *const alive_end = alive ? alive + g->alive_count : NULL;                         \
+        const float *factors = g->point_weights + at / 8 * g->panel;                                                   \
+        const float *const weights = g->weights + at * (size_t)(unsigned)g->steps;                                     \
+        for (size_t i = 0; i < 8; i++) {                                                                               \
+            for (size_t c = 0; c < n; c += 16) {                                                                       \
+                const float *p = g->points[DISTI_CELL(c)] + c % DISTI_BLOCK;                                           \
+                __m512 sum = _mm512_set1_ps(g->bias[at + i]);                                                          \
+                for (size_t j = 0; j < (size_t)(unsigned)g->point; j++)                                                \
+                    sum = _mm512_fmadd_ps(_mm512_set1_ps(factors[j * 8 + i]), _mm512_loadu_ps(p + j * DISTI_BLOCK),    \
+                                          sum);                                                                        \
+                _mm512_storeu_ps(sums + i * DISTI_COLUMNS + c, sum);                                                   \
+            }                                                                                                          \
+        }                                                                                                              \
+        for (int to = 0; to < g->steps;) {                                                                             \
+            const float *w = weights + (size_t)(unsigned)to * 8, *x = g->x + (size_t)(unsigned)to * DISTI_BLOCK;       \
+            to = DISTI_MIN(to + DISTI_SHORT, g->steps);                                                                \
+            DISTI_Y8(DISTI_ZERO, V)                                                                                    \
+            if (alive) {                                                                                               \
+                for (; alive < alive_end && *alive < to; alive++) {                                                    \
+                    const size_t k = (size_t)(unsigned)*alive;                                                         \
+                    DISTI_AHEAD(weights + k * 8, 256);                                                                 \
+                    DISTI_STEP(8, V, DISTI_SIDE, weights + k * 8, g->x + k * DISTI_BLOCK)                              \
+                }                                                                                                      \
+            } else {                                                                                                   \
+                const float *end = weights + (size_t)(unsigned)to * 8;                                                 \
+                for (; end - w >= 2 * 8; w += 2 * 8, x += 2 * DISTI_BLOCK) {                                           \
+                    DISTI_AHEAD(w, 256);                                                                               \
+                    DISTI_STEP(8, V, DISTI_SIDE, w, x)                                                                 \
+                    DISTI_STEP(8, V, DISTI_SIDE, w + 8, x + DISTI_BLOCK)                                               \
+                }                                                                                                      \
+                for (; w < end; w += 8, x += DISTI_BLOCK) DISTI_STEP(8, V, DISTI_SIDE, w, x)                           \
+            }                                                                                                          \
+            DISTI_Y8(DISTI_FLUSH, V)                                                                                   \
+        }                                                                                                              \
+        __mmask16 bad = 0;                                                                                             \
+        for (size_t i = 0; i < 8; i++) {                                                                               \
+            for (size_t c = 0; c < n; c += 16) {                                                                       \
+                float *sum = sums + i * DISTI_COLUMNS + c;                                                             \
+                const __m512 v = _mm512_loadu_ps(sum);                                                                 \
+                bad = (__mmask16)(bad | _mm512_fpclass_ps_mask(v, 0x99)); /* NaN, infinity */                          \
+                if (!g->activate) _mm512_storeu_ps(sum, DISTI_RELU(v));                                                \
+            }                                                                                                          \
+            if (g->activate) g->activate(g->activation, g->scale, n, sums + i * DISTI_COLUMNS, NULL);                  \
+            for (size_t c = 0; c < n && g->last[0]; c += 16)                                                           \
+                _mm512_storeu_ps(g->last[DISTI_CELL(c)] + (at + i) * DISTI_BLOCK + c % DISTI_BLOCK,                    \
+                                 _mm512_loadu_ps(sums + i * DISTI_COLUMNS + c));                                       \
+        }                                                                                                              \
+        g->bad |= bad;                                                                                                 \
+        for (size_t i = 0; i < 8 && !g->last[0]; i += DISTI_ROWS) {                                                    \
+            float *y = g->y + (at + i) / DISTI_ROWS * DISTI_BLOCK;                                                     \
+            __m512i any = _mm512_setzero_si512();                                                                      \
+            for (size_t j = 0; j < V; j++) {                                                                           \
+                const __m512i v = DISTI_NARROW(sums + i * DISTI_COLUMNS + j * (DISTI_COLUMNS / 3));                    \
+                any = _mm512_or_si512(any, v);                                                                         \
+                _mm512_storeu_si512((void *)(y + j * 16), v);                                                          \
+            }                                                                                                          \
+            g->y_alive[g->y_alive_count] = (int)((at + i) / DISTI_ROWS);                                               \
+            g->y_alive_count += (int)(at + i) < g->out && _mm512_test_epi32_mask(any, any) != 0;                       \
+        }                                                                                                              \
+    }
+#define DISTI_HALF_KERNEL(kind)                                                                                        \
+    DISTI_HALF_TILE(wide_##kind, 3)                                                                                    \
+    DISTI_HALF_TILE(middle_##kind, 2)                                                                                  \
+    DISTI_HALF_TILE(narrow_##kind, 1)                                                                                  \
+    DISTI_FUNCTION void disti_half_##kind(disti_half *g)                                                               \
+    {                                                                                                                  \
+        const int vectors = (g->columns * 3 + DISTI_COLUMNS - 1) / DISTI_COLUMNS;                                      \
+        for (int o = 0; o < g->out; o += 8) {                                                                          \
+            if (vectors == 3) disti_half_wide_##kind(g, o);                                                            \
+            else if (vectors == 2) disti_half_middle_##kind(g, o);                                                     \
+            else disti_half_narrow_##kind(g, o);                                                                       \
+        }                                                                                                              \
+    }
+
+/* Words besides those above: DISTI_COLUMNS points in a row's three vectors, DISTI_WIDEN f32 vectors for one of them,
+   DISTI_ROWS rows in a step, DISTI_SHORT steps between flushes, DISTI_NARROW(p) a vector of 16-bit values. */
+#undef DISTI_FUNCTION
+#undef DISTI_FMA
+#define DISTI_FUNCTION DISTI_TARGET("avx512f,avx512bw,avx512dq,avx512vl,fma,avx512fp16") DISTI_KERNEL static
+#define DISTI_FMA(a, b, c) disti_fma_f16(a, b, c)
+#define DISTI_COLUMNS (2 * DISTI_BLOCK)
+#define DISTI_WIDEN 2
+#define DISTI_ROWS 1
+#define DISTI_SHORT 128
+#define DISTI_FLUSH1(i, j) disti_flush_f16(sums + i * DISTI_COLUMNS + j * 32, a##i##j);
+#define DISTI_NARROW(p) disti_narrow_f16(p)
+/* By name, not by intrinsics: clang 14's are there only where the whole program is built for them. */
+DISTI_TARGET("avx512f,avx512fp16") DISTI_INLINE __m512 disti_fma_f16(__m512 a, __m512 b, __m512 c)
+{
+    __asm__("vfmadd231ph %1, %2, %0" : "+v"(c) : "v"(b), "v"(a));
+    return c;
+}
+DISTI_FUNCTION void disti_flush_f16(float *sum, __m512 v)
+{
+    const __m512 both = _mm512_maskz_shuffle_f32x4(0xffff, v, v, 0xee); /* the upper half, twice */
+    const __m512 low = _mm512_maskz_cvtph_ps(0xffff, _mm512_castsi512_si256(_mm512_castps_si512(v)));
+    const __m512 high = _mm512_maskz_cvtph_ps(0xffff, _mm512_castsi512_si256(_mm512_castps_si512(both)));
+    _mm512_storeu_ps(sum, _mm512_add_ps(_mm512_loadu_ps(sum), low));
+    _mm512_storeu_ps(sum + 16, _mm512_add_ps(_mm512_loadu_ps(sum + 16), high));
+}
+DISTI_FUNCTION __m512i disti_narrow_f16(const float *p)
+{
+    const __m256i low = _mm512_maskz_cvtps_ph(0xffff, _mm512_loadu_ps(p), _MM_FROUND_TO_NEAREST_INT);
+    const __m256i high = _mm512_maskz_cvtps_ph(0xffff, _mm512_loadu_ps(p + 16), _MM_FROUND_TO_NEAREST_INT);
+    return _mm512_maskz_inserti64x4(0xff, _mm512_castsi256_si512(low), high, 1);
+}
+DISTI_HALF_KERNEL(f16)
+
+#undef DISTI_FUNCTION
+#undef DISTI_FMA
+#undef DISTI_COLUMNS
+#undef DISTI_WIDEN
+#undef DISTI_ROWS
+#undef DISTI_SHORT
+#undef DISTI_FLUSH1
+#undef DISTI_NARROW
+#define DISTI_FUNCTION DISTI_TARGET("avx512f,avx512bw,avx512dq,avx512vl,fma,avx512bf16") DISTI_KERNEL static
+#define DISTI_FMA(a, b, c) disti_fma_bf16(a, b, c)
+#define DISTI_COLUMNS DISTI_BLOCK
+#define DISTI_WIDEN 1
+#define DISTI_ROWS 2
+#define DISTI_SHORT (1 << 30)
+#define DISTI_FLUSH1(i, j) disti_flush_bf16(sums + i * DISTI_COLUMNS + j * 16, a##i##j);
+#define DISTI_NARROW(p) disti_narrow_bf16(p)
+DISTI_TARGET("avx512f,avx512bf16") DISTI_INLINE __m512 disti_fma_bf16(__m512 a, __m512 b, __m512 c)
+{
+    __asm__("vdpbf16ps %1, %2, %0" : "+v"(c) : "v"(b), "v"(a));
+    return c;
+}
+DISTI_FUNCTION void disti_flush_bf16(float *sum, __m512 v)
+{
+    _mm512_storeu_ps(sum, _mm512_add_ps(_mm512_loadu_ps(sum), v));
+}
+/* Two rows, rounded to the nearest even, the first one in the low halves. */
+DISTI_FUNCTION __m512i disti_narrow_bf16(const float *p)
+{
+    const __m512i one = _mm512_set1_epi32(1), below = _mm512_set1_epi32(0x7fff);
+    __m512i low = _mm512_loadu_si512((const void *)p), high = _mm512_loadu_si512((const void *)(p + DISTI_COLUMNS));
+    const __m512i odd_low = _mm512_and_si512(_mm512_maskz_srli_epi32(0xffff, low, 16), one);
+    const __m512i odd_high = _mm512_and_si512(_mm512_maskz_srli_epi32(0xffff, high, 16), one);
+    low = _mm512_add_epi32(low, _mm512_add_epi32(below, odd_low));
+    high = _mm512_add_epi32(high, _mm512_add_epi32(below, odd_high));
+    return _mm512_mask_blend_epi16(0xaaaaaaaau, _mm512_maskz_srli_epi32(0xffff, low, 16), high);
+}
+DISTI_HALF_KERNEL(bf16)
+#undef DISTI_COLUMNS
+#undef DISTI_WIDEN
+#undef DISTI_ROWS
+#undef DISTI_SHORT
+#undef DISTI_FLUSH1
+#undef DISTI_NARROW
+#undef DISTI_CELL
+#undef DISTI_FLUSH
+#undef DISTI_HALF_TILE
+#undef DISTI_HALF_KERNEL
+#endif
 #endif
 
 #ifdef DISTI_NEON
@@ -4630,6 +4860,7 @@ typedef struct disti_linear {
     float scale;      /* on all columns: a skip layer's skip_scale, else 1 */
     size_t weight, bias, norm_weight, norm_bias; /* offsets into params */
     size_t panel;     /* offset into panels; the last layer's is plain (out, rows) */
+    size_t half_panel; /* likewise into half_panels; hidden layers' previous units only */
 } disti_linear;
 
 struct dist_net {
@@ -4648,7 +4879,9 @@ struct dist_net {
     int fold_count; /* layers that see the code */
     disti_linear layer[DISTI_MAX_LAYERS];
     float *params, *panels, *codes;
-    size_t param_count, panel_count;
+    float *half_panels; /* 32 bits each: two 16-bit weights; NULL: none */
+    int half;           /* DIST_HALF_F16 or BF16, or 0 */
+    size_t param_count, panel_count, half_count;
     char channel_names[DISTI_MAX_CHANNELS][8];
 };
 
@@ -4658,6 +4891,7 @@ struct dist_shape {
     float *code;
     float *bias; /* (layers + 1, max_rows): each layer's bias with the code folded in; then zeros, for tangents */
     float lipschitz, lipschitz_far;
+    float half_error; /* largest of 16 bits at the samples of disti_shape_slope */
     uint32_t all_alive; /* bit l: the samples of disti_shape_slope met no dead unit at layer l's input */
     dist_shape *texture; /* the net that colors it, with [code, color code] folded in; NULL: none */
     float *store; /* activations and deltas of store_blocks blocks, for weight gradients */
@@ -5405,6 +5639,83 @@ static void disti_shape_eval_fn(void *user, int worker, size_t n, const float *p
     else disti_shape_fused(user, worker, n, points, sdf, gradient, NULL, NULL, NULL);
 }
 
+#ifdef DISTI_HALF
+/* Hidden layer l of 96 points (f16) or 48 (bf16), x to y. */
+static void disti_half_hidden(const dist_shape *shape, const disti_kernels *kernels, const disti_block *b, int l,
+                              disti_half *h)
+{
+    const dist_net *net = shape->net;
+    const disti_linear *layer = &net->layer[l];
+    size_t rows = (size_t)(layer->prev + layer->point);
+    int last = l + 2 == net->layers, pairs = net->half == DIST_HALF_BF16;
+    h->steps = pairs ? (layer->prev + 1) / 2 : layer->prev;
+    h->weights = net->half_panels + layer->half_panel;
+    h->point_weights = net->panels + layer->panel + (size_t)layer->prev * 8;
+    h->panel = rows * 8;
+    h->point = layer->point;
+    h->bias = shape->bias + (size_t)l * (size_t)net->max_rows;
+    h->x = b->act[l & 1];
+    h->y = b->act[(l & 1) ^ 1];
+    h->alive_count = h->y_alive_count;
+    h->alive = h->alive_count < h->steps ? b->alive + (size_t)l * (size_t)net->max_rows : NULL;
+    h->y_alive = b->alive + (size_t)(l + 1) * (size_t)net->max_rows;
+    h->y_alive_count = 0;
+    h->last[0] = last ? b->delta[0] : NULL;
+    h->last[1] = last ? b->delta[1] : NULL;
+    h->activate = net->activation == DIST_ACTIVATION_RELU ? NULL : kernels->activate;
+    h->activation = net->activation;
+    h->scale = l == 0 ? net->first_scale : net->scale;
+    h->out = layer->out;
+    if (pairs) disti_half_bf16(h);
+    else disti_half_f16(h);
+}
+
+/* dist_field.coarse_fn of a net: the hidden layers in 16 bits; a block with a sum that is not finite again in f32. */
+static void disti_shape_coarse(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    const dist_shape *shape = (const dist_shape *)user;
+    const dist_net *net = shape->net;
+    const disti_linear *last = &net->layer[net->layers - 1];
+    disti_kernels kernels = disti_kernels_for(shape->ctx->isa);
+    size_t wide = net->half == DIST_HALF_F16 ? 2 * DISTI_BLOCK : DISTI_BLOCK;
+    if (gradient || !net->half) {
+        disti_shape_fused(user, worker, n, points, sdf, gradient, NULL, NULL, NULL);
+        return;
+    }
+    for (size_t at = 0; at < n; at += wide) {
+        size_t count = DISTI_MIN(n - at, wide), first = DISTI_MIN(count, (size_t)DISTI_BLOCK);
+        disti_counter *counter = disti_counter_of(shape->ctx, worker);
+        disti_block b;
+        disti_half h;
+        memset(&h, 0, sizeof h);
+        disti_block_begin(shape, worker, &b, first, points + 3 * at);
+        if (wide > DISTI_BLOCK) /* idle lanes repeat a point here too */
+            disti_encode(net, count > first ? count - first : 1, points + 3 * (at + (count > first ? first : 0)),
+                         b.d_point);
+        counter->dense += (double)dist_net_operations(net, 1) * (double)(count - first);
+        h.points[0] = b.point;
+        h.points[1] = b.d_point;
+        h.columns = (int)count;
+        double done = (double)dist_net_operations(net, 1);
+        for (int l = 0; l + 1 < net->layers; l++) {
+            disti_half_hidden(shape, &kernels, &b, l, &h);
+            done -= (double)(h.steps - h.alive_count) * net->layer[l].prev / DISTI_MAX(h.steps, 1) * h.out;
+        }
+        counter->done += done * (double)count;
+        b.values = 1;
+        b.alive_count[net->layers - 1] = last->prev + last->point;
+        for (size_t from = 0, k = 0; from < count && !h.bad; from += DISTI_BLOCK, k++) {
+            b.columns = (int)DISTI_MIN(count - from, (size_t)DISTI_BLOCK);
+            memcpy(b.delta[k] + (size_t)last->prev * DISTI_BLOCK, h.points[k],
+                   (size_t)last->point * DISTI_BLOCK * sizeof(float));
+            disti_net_output(shape, &b, b.delta[k], net->sdf_channel, b.tail, b.tail + DISTI_BLOCK, NULL);
+            memcpy(sdf + at + from, b.tail, (size_t)b.columns * sizeof(float));
+        }
+        if (h.bad) disti_shape_fused(user, worker, count, points + 3 * at, sdf + at, NULL, NULL, NULL, NULL);
+    }
+}
+#endif
+
 /* All channels (n, channels), or `count` of them from `first`. */
 static void disti_shape_channels(const dist_shape *shape, int worker, size_t n, const float *points, int first,
                                  int count, float *channels)
@@ -5714,13 +6025,14 @@ static void disti_shape_color_weights_fn(void *user, dist_context *ctx, size_t n
 /* Sampled |grad f| outside the surface: the 4/5 quantile near it, 31/32 beyond disti_far_from, at least 1. What matters
    is not the steepest spot but how far f exceeds the distance, which is its mean slope on the way. Half of the 768
    points are those of a fixed low-discrepancy sequence (the plastic number's) in the bounding sphere, half are these
-   moved along their gradients to a place near the surface. Notes which layers meet no dead unit there. */
+   moved along their gradients to a place near the surface. Notes which layers meet no dead unit there,
+   and what 16 bits are off. */
 static void disti_shape_slope(dist_shape *shape, const dist_field *field)
 {
     enum { ROUNDS = 16, BINS = 256 };
     static const double step[3] = {0.8191725133961645, 0.6710436067037893, 0.5497004779019703};
     int bins[2][BINS], count[2] = {0, 0};
-    float points[3 * DISTI_BLOCK], sdf[DISTI_BLOCK], gradient[3 * DISTI_BLOCK], slopes[2];
+    float points[3 * DISTI_BLOCK], sdf[DISTI_BLOCK], gradient[3 * DISTI_BLOCK], coarse[DISTI_BLOCK], slopes[2];
     float beyond = disti_far_from(field);
     const dist_net *net = shape->net;
     disti_block b;
@@ -5746,8 +6058,13 @@ static void disti_shape_slope(dist_shape *shape, const dist_field *field)
             j += round & 1 || length <= 1.0;
         }
         unsigned state = disti_float_state_enter();
+        if (field->coarse_fn) field->coarse_fn(shape, 0, DISTI_BLOCK, points, coarse, NULL);
         field->eval_fn(shape, 0, DISTI_BLOCK, points, sdf, gradient);
         disti_float_state_leave(state);
+        for (int j = 0; field->coarse_fn && j < DISTI_BLOCK; j++) {
+            float error = coarse[j] > sdf[j] ? coarse[j] - sdf[j] : sdf[j] - coarse[j];
+            if (disti_finite(error)) shape->half_error = DISTI_MAX(shape->half_error, error);
+        }
         disti_block_layout(net, disti_lane(shape->ctx, 0), &b);
         for (int l = 1; l < net->layers; l++)
             for (int k = 0; k < net->layer[l].prev; k++)
@@ -5781,6 +6098,12 @@ DIST_API dist_field dist_shape_field(dist_shape *shape)
     if (net->sdf_channel >= 0) {
         field.eval_fn = disti_shape_eval_fn;
         field.fused_fn = disti_shape_fused;
+#ifdef DISTI_HALF
+        if (net->half && shape->ctx->isa == DIST_ISA_AVX512) {
+            field.coarse_fn = disti_shape_coarse;
+            field.coarse_error = shape->half_error;
+        }
+#endif
 #ifndef DIST_NO_BACKWARD
         field.second_fn = disti_shape_second;
 #endif
@@ -6029,6 +6352,7 @@ static void disti_net_free(dist_net *net)
     dist_allocator allocator = net->allocator;
     if (net->params) allocator.free_fn(allocator.user, net->params, net->param_count * sizeof(float));
     if (net->panels) allocator.free_fn(allocator.user, net->panels, net->panel_count * sizeof(float));
+    if (net->half_panels) allocator.free_fn(allocator.user, net->half_panels, net->half_count * sizeof(float));
     if (net->codes)
         allocator.free_fn(allocator.user, net->codes, (size_t)net->code_count * (size_t)net->code_size * sizeof(float));
     allocator.free_fn(allocator.user, net, sizeof *net);
@@ -6099,6 +6423,57 @@ static dist_status disti_net_arrange(dist_context *ctx, dist_net *net, const cha
     return net->params && net->panels && (net->code_count == 0 || net->codes) ? DIST_OK : DIST_OUT_OF_MEMORY;
 }
 
+static size_t disti_half_steps(const disti_linear *layer, int kind)
+{
+    return (size_t)(kind == DIST_HALF_BF16 ? (layer->prev + 1) / 2 : layer->prev);
+}
+
+/* The largest weight that is packed. */
+static float disti_half_largest(const dist_net *net)
+{
+    float largest = 0.0f;
+    for (int l = 1; l + 1 < net->layers; l++) {
+        const disti_linear *layer = &net->layer[l];
+        size_t rows = (size_t)(layer->prev + layer->point), count = ((size_t)layer->out + 7) / 8 * 8 * rows;
+        for (size_t i = 0; i < count; i++) {
+            float w = net->panels[layer->panel + i];
+            if (i / 8 % rows < (size_t)layer->prev) largest = DISTI_MAX(largest, w < 0.0f ? -w : w);
+        }
+    }
+    return largest;
+}
+
+#ifdef DISTI_HALF
+DISTI_TARGET("f16c") static uint32_t disti_f16_bits(float x) { return (uint32_t)_cvtss_sh(x, 0); }
+#else
+static uint32_t disti_f16_bits(float x) { return (void)x, 0; } /* never: dist_net_set_half refuses */
+#endif
+
+/* panels to half_panels, the previous units' columns: (w, w) in f16, rows 2 k and 2 k + 1 in bf16. */
+static void disti_half_pack(dist_net *net)
+{
+    for (int l = 0; l + 1 < net->layers; l++) {
+        const disti_linear *layer = &net->layer[l];
+        size_t rows = (size_t)(layer->prev + layer->point), steps = disti_half_steps(layer, net->half);
+        for (size_t o = 0; o < (size_t)layer->out; o += 8) {
+            for (size_t at = 0; at < steps * 8; at++) {
+                const float *w = net->panels + layer->panel + o * rows;
+                uint32_t bits[2] = {0, 0};
+                if (net->half == DIST_HALF_F16) {
+                    bits[0] = bits[1] = disti_f16_bits(w[at]);
+                } else {
+                    for (size_t i = 0; i < 2 && 2 * (at / 8) + i < (size_t)layer->prev; i++) {
+                        memcpy(&bits[i], w + (2 * (at / 8) + i) * 8 + at % 8, sizeof *bits);
+                        bits[i] = (bits[i] + 0x7fff + (bits[i] >> 16 & 1)) >> 16;
+                    }
+                }
+                bits[0] |= bits[1] << 16;
+                memcpy(net->half_panels + layer->half_panel + o * steps + at, bits, sizeof *bits);
+            }
+        }
+    }
+}
+
 /* params to panels: kernels' order, without the code's columns, skip_scale multiplied in. */
 static void disti_net_pack(dist_net *net)
 {
@@ -6117,7 +6492,50 @@ static void disti_net_pack(dist_net *net)
             }
         }
     }
+    if (net->half == DIST_HALF_F16 && disti_half_largest(net) > 65504.0f) net->half = DIST_HALF_OFF;
+    if (net->half) disti_half_pack(net);
 }
+
+DIST_API dist_status dist_net_set_half(dist_context *ctx, dist_net *net, int kind)
+{
+    const char *name = "dist_net_set_half";
+    dist_status status = disti_enter(ctx, name);
+    if (status != DIST_OK) return status;
+    if (!net) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: net is NULL", name, 0, 0);
+    if (kind < DIST_HALF_OFF || kind > DIST_HALF_BF16)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: kind is %d, must be a DIST_HALF_ constant", name, kind, 0);
+    float largest = disti_half_largest(net);
+    if (kind == DIST_HALF_AUTO)
+        kind = disti_cpu_half(DIST_HALF_F16) && largest <= 65504.0f ? DIST_HALF_F16 : DIST_HALF_BF16;
+    if (kind != DIST_HALF_OFF && !disti_cpu_half(kind))
+        return disti_fail(ctx, DIST_UNSUPPORTED, "dist_net_set_half: this processor or this build has no %s arithmetic",
+                          kind == DIST_HALF_F16 ? "f16" : "bf16", 0, 0);
+    if (kind == DIST_HALF_F16 && largest > 65504.0f)
+        return disti_fail(ctx, DIST_UNSUPPORTED, "%s: a weight is %d, beyond f16's largest number 65504", name,
+                          (double)largest, 0);
+    if (kind != DIST_HALF_OFF && net->normed)
+        return disti_fail(ctx, DIST_UNSUPPORTED, "%s: nets with LayerNorm have no 16-bit kernel", name, 0, 0);
+    float *panels = NULL;
+    size_t count = 0;
+    for (int l = 0; l + 1 < net->layers && kind != DIST_HALF_OFF; l++) {
+        disti_linear *layer = &net->layer[l];
+        layer->half_panel = count;
+        count += disti_half_steps(layer, kind) * (((size_t)layer->out + 7) & ~(size_t)7);
+    }
+    if (count > 0) {
+        panels = (float *)net->allocator.alloc_fn(net->allocator.user, count * sizeof(float), DISTI_ALIGNMENT);
+        if (!panels) return disti_fail(ctx, DIST_OUT_OF_MEMORY, "%s: out of memory", name, 0, 0);
+    }
+    dist_allocator *own = &net->allocator;
+    if (net->half_panels) own->free_fn(own->user, net->half_panels, net->half_count * sizeof(float));
+    net->half_panels = panels;
+    net->half_count = count;
+    net->half = kind;
+    if (kind != DIST_HALF_OFF) disti_half_pack(net);
+    return DIST_OK;
+}
+
+DIST_API int dist_net_half(const dist_net *net) { return net ? net->half : DIST_HALF_OFF; }
 
 /* What dist_net_load carries along. */
 typedef struct disti_loader {

@@ -4,8 +4,10 @@
 
    mode dense: every unit alive, so every multiply-add is done. dead: a real decoder at its own surface, where most
    units are zero and left out; its rate counts what a dense net would do. backward: value and gradient at the point;
-   backward_code: that and the code's gradient. gflops counts the forward pass alone in all modes; of_forward is the
-   time in forward passes; executed is the share of the forward multiply-adds that was done. */
+   backward_code: that and the code's gradient. f16, bf16, and f16_dead, bf16_dead: the hidden layers in 16 bits, where
+   the processor has the instructions, against the peak of those; max_error and rms_error are against f32. gflops counts
+   the forward pass alone in all modes; of_forward is the time in f32 forward passes; executed is the share of the
+   forward multiply-adds that was done. */
 #define DIST_IMPLEMENTATION
 #include "../dist.h"
 #include "../examples/common.h"
@@ -33,7 +35,8 @@ static const net_case cases[] = {
     {"4x64", 4, 64, 0, 16},    {"8x32", 8, 32, 0, 16},
 };
 
-enum { CASES = sizeof cases / sizeof cases[0], MODES = 3, REPETITIONS_MAX = 1001 };
+enum { CASES = sizeof cases / sizeof cases[0], REPETITIONS_MAX = 1001 };
+enum { FORWARD, BACKWARD, BACKWARD_CODE, F16, BF16, MODES };
 
 typedef struct settings {
     const char *only_case, *only_isa, *model;
@@ -44,10 +47,10 @@ typedef struct settings {
 
 typedef struct work {
     dist_context *ctx;
-    dist_field field;
+    dist_field field, half[2]; /* half: in f16 and bf16; without eval_fn: not here */
     size_t batch;
     const float *points;
-    float *sdf, *gradient, *d_sdf, *d_code;
+    float *sdf, *half_sdf, *gradient, *d_sdf, *d_code;
     double operations;
 } work;
 
@@ -64,9 +67,10 @@ static void work_once(const work *w, int mode)
     dist_gradients grads;
     memset(&grads, 0, sizeof grads);
     grads.code = w->d_code;
-    if (mode == 0) { dist_field_eval(w->ctx, &w->field, w->batch, w->points, w->sdf, NULL); }
-    if (mode == 1) { dist_field_eval(w->ctx, &w->field, w->batch, w->points, w->sdf, w->gradient); }
-    if (mode == 2) {
+    if (mode == FORWARD) { dist_field_eval(w->ctx, &w->field, w->batch, w->points, w->sdf, NULL); }
+    if (mode >= F16) { dist_field_eval(w->ctx, &w->half[mode - F16], w->batch, w->points, w->half_sdf, NULL); }
+    if (mode == BACKWARD) { dist_field_eval(w->ctx, &w->field, w->batch, w->points, w->sdf, w->gradient); }
+    if (mode == BACKWARD_CODE) {
         dist_field_backward(w->ctx, &w->field, w->batch, w->points, w->d_sdf, seed_ones, NULL, w->gradient, &grads);
     }
 }
@@ -82,7 +86,7 @@ static double work_time(const work *w, int mode, int passes)
 }
 
 /* Share of the multiply-adds that were not left out as dead units, of one forward pass over the batch. */
-static double executed_share(const work *w)
+static double executed_share(const work *w, int mode)
 {
     double dense = 0;
     double done = 0;
@@ -90,7 +94,7 @@ static double executed_share(const work *w)
     for (int i = 0; i < workers; i++) {
         memset(disti_counter_of(w->ctx, i), 0, sizeof(disti_counter));
     }
-    work_once(w, 0);
+    work_once(w, mode);
     for (int i = 0; i < workers; i++) {
         dense += disti_counter_of(w->ctx, i)->dense;
         done += disti_counter_of(w->ctx, i)->done;
@@ -98,16 +102,24 @@ static double executed_share(const work *w)
     return dense > 0 ? done / dense : 1;
 }
 
-/* Measures the three modes of one net in turn with the peak, several times, and prints a row each. */
-static void measure(const settings *s, const char *name, const work *w, const char *forward_name)
+static int has_mode(const work *w, int mode)
 {
-    static const char *const backward_names[MODES] = {NULL, "backward", "backward_code"};
-    static double peaks[REPETITIONS_MAX], times[MODES][REPETITIONS_MAX];
+    if (mode == BACKWARD_CODE) { return w->d_code != NULL; }
+    return mode < F16 || w->half[mode - F16].eval_fn;
+}
+
+/* Measures the modes of one net in turn with the peaks of their instructions, several times, and prints a row each. */
+static void measure(const settings *s, const char *name, const work *w, int dead)
+{
+    static const char *const names[2][MODES] = {{"dense", "backward", "backward_code", "f16", "bf16"},
+                                                {"dead", "backward", "backward_code", "f16_dead", "bf16_dead"}};
+    static double peaks[3][REPETITIONS_MAX], times[MODES][REPETITIONS_MAX]; /* peaks: f32, f16, bf16 */
+    static const int halves[3] = {DIST_HALF_OFF, DIST_HALF_F16, DIST_HALF_BF16};
     double length = s->quick ? 0.004 : 0.02;
     int passes[MODES];
-    int modes = w->d_code ? MODES : MODES - 1;
     size_t n = (size_t)s->repetitions;
-    for (int m = 0; m < modes; m++) { /* also warms caches and threads */
+    for (int m = 0; m < MODES; m++) { /* also warms caches and threads */
+        if (!has_mode(w, m)) { continue; }
         double once = work_time(w, m, 1);
         once = work_time(w, m, once < length ? 2 : 1);
         passes[m] = once < length ? (int)(length / (once + 1e-7)) + 1 : 1;
@@ -116,24 +128,35 @@ static void measure(const settings *s, const char *name, const work *w, const ch
     double taken = 0;
     peak_once(w->ctx, 100000, &taken);
     long loops = (long)(100000 * length / (taken + 1e-5)) + 1;
-    double executed = executed_share(w);
     for (size_t r = 0; r < n; r++) {
-        peaks[r] = -peak_once(w->ctx, loops, &taken);
-        for (int m = 0; m < modes; m++) {
-            times[m][r] = work_time(w, m, passes[m]);
+        for (int k = 0; k < 3; k++) {
+            if (k == 0 || has_mode(w, F16 + k - 1)) { peaks[k][r] = -peak_half(w->ctx, halves[k], loops, &taken); }
+        }
+        for (int m = 0; m < MODES; m++) {
+            if (has_mode(w, m)) { times[m][r] = work_time(w, m, passes[m]); }
         }
     }
     check(w->ctx);
     double share = s->best ? 0.0 : 0.5;
-    double peak = -quantile(n, peaks, share);
-    double forward = quantile(n, times[0], share);
-    for (int m = 0; m < modes; m++) {
+    double forward = quantile(n, times[FORWARD], share);
+    for (int m = 0; m < MODES; m++) {
+        double largest = 0;
+        double squares = 0;
+        if (!has_mode(w, m)) { continue; }
+        double executed = executed_share(w, m < F16 ? FORWARD : m);
+        double peak = -quantile(n, peaks[m < F16 ? 0 : m - F16 + 1], share);
         double seconds = quantile(n, times[m], share);
         double rate = (double)w->batch / seconds;
         double gflops = 2e-9 * w->operations * rate;
-        printf("%s,%s,%d,%.0f,%.6f,%.0f,%.1f,%.1f,%.3f,%s,%.2f,%.3f\n", name, dist_isa_name(dist_context_isa(w->ctx)),
-               dist_context_workers(w->ctx), (double)w->batch, seconds, rate, gflops, peak, gflops / peak,
-               m == 0 ? forward_name : backward_names[m], seconds / forward, executed);
+        for (size_t i = 0; i < w->batch && m >= F16; i++) {
+            double e = fabs((double)w->half_sdf[i] - (double)w->sdf[i]);
+            largest = e > largest ? e : largest;
+            squares += e * e;
+        }
+        printf("%s,%s,%d,%.0f,%.6f,%.0f,%.1f,%.1f,%.3f,%s,%.2f,%.3f,%.3g,%.3g\n", name,
+               dist_isa_name(dist_context_isa(w->ctx)), dist_context_workers(w->ctx), (double)w->batch, seconds, rate,
+               gflops, peak, gflops / peak, names[dead][m], seconds / forward, executed, largest,
+               sqrt(squares / (double)w->batch));
     }
     fflush(stdout);
 }
@@ -226,12 +249,30 @@ static void measure_net(const settings *s, const net_case *c, int isa, int threa
     if (!c) { w.batch = surface_points(w.ctx, &w.field, w.batch, points); }
     w.points = points;
     w.sdf = take_floats(w.batch);
+    w.half_sdf = take_floats(w.batch);
     w.d_sdf = take_floats(w.batch);
     w.gradient = take_floats(3 * w.batch);
     if (dist_net_code_size(net)) { w.d_code = take_floats((size_t)dist_net_code_size(net)); }
-    measure(s, c ? c->name : s->model, &w, c ? "dense" : "dead");
+    dist_net *halves[2] = {NULL, NULL};
+    dist_shape *shapes[2] = {NULL, NULL};
+    for (int k = 0; k < 2 && isa == DIST_ISA_AVX512; k++) {
+        int kind = k == 0 ? DIST_HALF_F16 : DIST_HALF_BF16;
+        if (!disti_cpu_half(kind) || net->normed) { continue; }
+        halves[k] = c ? make_net(w.ctx, c) : load_model(w.ctx, s->model);
+        dist_net_set_half(w.ctx, halves[k], kind);
+        shapes[k] = dist_shape_create(w.ctx, halves[k], code);
+        check(w.ctx);
+        w.half[k] = dist_shape_field(shapes[k]);
+        w.half[k].eval_fn = w.half[k].coarse_fn;
+    }
+    measure(s, c ? c->name : s->model, &w, !c);
+    for (int k = 0; k < 2; k++) {
+        dist_shape_destroy(shapes[k]);
+        dist_net_destroy(halves[k]);
+    }
     free(points);
     free(w.sdf);
+    free(w.half_sdf);
     free(w.d_sdf);
     free(w.gradient);
     free(w.d_code);
@@ -275,7 +316,8 @@ int main(int argc, char **argv)
 #if defined(_OPENMP) && !defined(DIST_NO_OPENMP)
     most = s.quick ? 1 : s.threads;
 #endif
-    puts("case,isa,threads,batch,seconds,queries_per_s,gflops,peak_gflops,share,mode,of_forward,executed");
+    puts("case,isa,threads,batch,seconds,queries_per_s,gflops,peak_gflops,share,mode,of_forward,executed,max_error,"
+         "rms_error");
     for (int i = 0; i < (s.model ? 1 : (int)CASES); i++) {
         const net_case *c = s.model ? NULL : &cases[i];
         if (c && s.only_case && strcmp(s.only_case, c->name) != 0) { continue; }

@@ -56,6 +56,17 @@ PEAK(peak_avx2, TARGET("avx2,fma"), __m256, _mm256_set1_ps, _mm256_storeu_ps, 8,
      STEP_256, SUM_256)
 PEAK(peak_avx512, TARGET("avx512f"), __m512, _mm512_set1_ps, _mm512_storeu_ps, 16, CHAINS24, 24, DECLARE_512, STEP_512,
      SUM_512)
+#ifdef DISTI_HALF
+/* 16 bits: a vector of 32 f16 products, or 16 sums of two bf16 products each, in one instruction. */
+#define SET_HALF(x) _mm512_castsi512_ps(_mm512_set1_epi32((x) > 0.5f ? 0x3bff3bff : 0x14001400))
+#define DECLARE_HALF(i) __m512 x##i = _mm512_castsi512_ps(_mm512_set1_epi32(0x14001400 + (i)));
+#define STEP_F16(i) __asm__("vfmadd213ph %2, %1, %0" : "+v"(x##i) : "v"(m), "v"(a));
+#define STEP_BF16(i) __asm__("vdpbf16ps %2, %1, %0" : "+v"(x##i) : "v"(m), "v"(a));
+PEAK(peak_f16, TARGET("avx512f,avx512fp16"), __m512, SET_HALF, _mm512_storeu_ps, 32, CHAINS24, 24, DECLARE_HALF,
+     STEP_F16, SUM_512)
+PEAK(peak_bf16, TARGET("avx512f,avx512bf16"), __m512, SET_HALF, _mm512_storeu_ps, 32, CHAINS24, 24, DECLARE_HALF,
+     STEP_BF16, SUM_512)
+#endif
 #undef TARGET
 #else
 /* Without intrinsics the chains are plain C; volatile constants keep the compiler from working ahead. */
@@ -96,8 +107,13 @@ static double peak_neon(long loops, float *sink)
 }
 #endif
 
-static inline double peak_loop(int isa, long loops, float *sink)
+static inline double peak_loop(int isa, int half, long loops, float *sink)
 {
+#ifdef DISTI_HALF
+    if (half == DIST_HALF_F16) { return peak_f16(loops, sink); }
+    if (half == DIST_HALF_BF16) { return peak_bf16(loops, sink); }
+#endif
+    (void)half;
 #ifdef PEAK_X86
     if (isa == DIST_ISA_SSE2) { return peak_sse2(loops, sink); }
     if (isa == DIST_ISA_AVX2) { return peak_avx2(loops, sink); }
@@ -111,7 +127,7 @@ static inline double peak_loop(int isa, long loops, float *sink)
 }
 
 typedef struct peak_job {
-    int isa;
+    int isa, half;
     long loops;
     double operations[64];
     float sink[64];
@@ -121,7 +137,7 @@ static inline void peak_task(void *arg, int index, int worker)
 {
     peak_job *job = (peak_job *)arg;
     (void)worker;
-    job->operations[index] = peak_loop(job->isa, job->loops, &job->sink[index]);
+    job->operations[index] = peak_loop(job->isa, job->half, job->loops, &job->sink[index]);
 }
 
 /* One thread is timed by its processor time, which other programs disturb least; several by the clock. */
@@ -130,8 +146,8 @@ static inline double now_of(const dist_context *ctx)
     return dist_context_workers(ctx) == 1 ? (double)clock() / (double)CLOCKS_PER_SEC : seconds_now();
 }
 
-/* GFLOP/s of all workers together, once; *taken gets the seconds. */
-static inline double peak_once(dist_context *ctx, long loops, double *taken)
+/* GFLOP/s of all workers together, once; *taken gets the seconds. half: of DIST_HALF_F16 or BF16; 0: in f32. */
+static inline double peak_half(dist_context *ctx, int half, long loops, double *taken)
 {
     static volatile float keep;
     peak_job job;
@@ -139,6 +155,7 @@ static inline double peak_once(dist_context *ctx, long loops, double *taken)
     double sum = 0;
     memset(&job, 0, sizeof job);
     job.isa = dist_context_isa(ctx);
+    job.half = half;
     job.loops = loops;
     double start = now_of(ctx);
     disti_run(ctx, workers, peak_task, &job);
@@ -148,6 +165,11 @@ static inline double peak_once(dist_context *ctx, long loops, double *taken)
         keep = keep + job.sink[i];
     }
     return sum / (*taken + 1e-9) * 1e-9;
+}
+
+static inline double peak_once(dist_context *ctx, long loops, double *taken)
+{
+    return peak_half(ctx, DIST_HALF_OFF, loops, taken);
 }
 
 #endif

@@ -65,6 +65,9 @@ without DIST_NO_BACKWARD '[Tt] dist_[a-z_]*backward|[Tt] dist_adam_step'
 without DIST_NO_TRAIN '[Tt] dist_net_(create|set_weights|set_code)'
 without DIST_NO_MESH '[Tt] dist_(mesh_[a-z]*|chamfer)'
 without DIST_NO_SIMD '[Tt] disti?_[a-z_0-9]*_(sse2|avx2|avx512|neon)'
+$CC -DSMALL_LIBRARY -DDIST_NO_HALF -c tests/small.c -o "$work/c.o" 2>/dev/null && nm "$work/c.o" |
+    grep -E ' [Tt] disti_[a-z_]*_b?f16$' >"$work/left"
+expect_nothing DIST_NO_HALF_leaves_out "$work/left"
 $CC -DDIST_IMPLEMENTATION -DDIST_STATIC -DDIST_NO_SIMD -c tests/small.c -o "$work/c.o" 2>/dev/null
 nm "$work/c.o" 2>/dev/null | grep ' [TWV] dist' >"$work/left"
 expect_nothing DIST_STATIC_exports_nothing "$work/left"

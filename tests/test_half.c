@@ -1,0 +1,319 @@
+/* SPDX-License-Identifier: MIT-0
+   test_half.c - networks in 16 bits: each kernel against f32, ragged sizes, overflow, what is refused */
+#include "test.h"
+
+#include "model.h"
+
+enum { POINTS = 200 };
+static const int kinds[2] = {DIST_HALF_F16, DIST_HALF_BF16};
+
+/* In this processor, this build and the context's instruction set. */
+static int has(int kind)
+{
+    dist_context *ctx = test_context();
+    int isa = dist_context_isa(ctx);
+    dist_context_destroy(ctx);
+    return isa == DIST_ISA_AVX512 && disti_cpu_half(kind);
+}
+
+#define NEEDS(what) \
+    if (!(what)) SKIP("no 16-bit instructions in this processor, build or instruction set")
+
+static void refused(dist_context *ctx, dist_status expected, dist_status status, const char *part)
+{
+    CHECK_EQUAL(expected, status);
+    CHECK_TEXT(part, dist_context_message(ctx));
+    dist_context_clear(ctx);
+}
+
+/* f at a point in double, and in *bound what rounding can do to it at most. With u half a unit in the last place, w~ =
+   w (1 + u), x~ = x (1 + u) and sums of m terms, a unit's error is
+       e'_o = sum_k |w_ok| (e_k + (2 u + g) (|x_k| + e_k)),   g = min(m, 128) u in f16, whose sums are that short,
+   and activations pass it on by their steepest slope. */
+static double reference(const dist_shape *shape, const float *p, double *bound)
+{
+    static double x[2][1024], e[2][1024];
+    static float rows[128 * DISTI_BLOCK];
+    const dist_net *net = shape->net;
+    int f16 = net->half == DIST_HALF_F16, at = 0;
+    disti_encode(net, 1, p, rows);
+    for (int l = 0; l < net->layers; l++, at ^= 1) {
+        const disti_linear *layer = &net->layer[l];
+        int last = l + 1 == net->layers, count = layer->prev + layer->point;
+        double u = last ? 0.0 : f16 ? 1.0 / 2048 : 1.0 / 256;
+        double g = last || !f16 ? 2e-5 : u * (layer->prev < 128 ? layer->prev : 128);
+        float scale = l == 0 ? net->first_scale : net->scale;
+        for (int o = 0; o < (last ? net->sdf_channel + 1 : layer->out); o++) {
+            double sum = (double)shape->bias[(size_t)l * (size_t)net->max_rows + (size_t)o], error = 0.0;
+            for (int k = 0; k < count; k++) {
+                size_t panel = last ? (size_t)(o * count + k) : (size_t)((o / 8 * count + k) * 8 + o % 8);
+                double w = (double)net->panels[layer->panel + panel];
+                double v = k < layer->prev ? x[at][k] : (double)rows[(k - layer->prev) * DISTI_BLOCK];
+                double known = k < layer->prev ? e[at][k] : 0.0;
+                sum += w * v;
+                error += fabs(w) * (known + (k < layer->prev ? (2 * u + g) * (fabs(v) + known) + 1e-6 : 1e-6));
+            }
+            float slope;
+            x[at ^ 1][o] = last ? sum : (double)disti_activate_one(net->activation, scale, (float)sum, &slope);
+            e[at ^ 1][o] = error * (!last && net->activation == DIST_ACTIVATION_SINE ? (double)scale : 1.0) + 1e-6;
+        }
+    }
+    double f = x[at][net->sdf_channel];
+    *bound = e[at][net->sdf_channel];
+    if (net->output == DISTI_OUTPUT_TANH || net->output == DISTI_OUTPUT_TANH_TWICE) f = tanh(f);
+    if (net->output == DISTI_OUTPUT_TANH_TWICE) f = tanh(f);
+    if (net->output == DISTI_OUTPUT_SIGMOID) f = 1.0 / (1.0 + exp(-f));
+    return f - (double)net->level;
+}
+
+/* Evaluates the net in 16 bits in batches of several sizes: within the bound of f, the same bits in every batch, and
+   not f32 under another name. Returns the largest error over its bound. */
+static void check_net(dist_context *ctx, dist_net *net, int kind, const char *name)
+{
+    static const size_t sizes[] = {1, 16, 17, 33, 48, 49, 64, 65, 95, 96, 97, POINTS};
+    float points[3 * POINTS], sdf[POINTS], half[POINTS], batch[POINTS];
+    test_random random = test_random_seed(5);
+    CHECK_STATUS(DIST_OK, dist_net_set_half(ctx, net, kind), ctx);
+    CHECK_EQUAL(kind, dist_net_half(net));
+    dist_shape *shape = dist_shape_create(ctx, net, NULL);
+    dist_field exact = dist_shape_field(shape), field = exact;
+    CHECK(field.coarse_fn != NULL && field.coarse_error >= 0.0f);
+    field.eval_fn = field.coarse_fn;
+    test_random_fill(&random, 3 * POINTS, points, -0.6f, 0.6f);
+    dist_field_eval(ctx, &exact, POINTS, points, sdf, NULL);
+    CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &field, POINTS, points, half, NULL), ctx);
+    for (int i = 0; i < POINTS; i++) {
+        double bound, f = reference(shape, points + 3 * i, &bound);
+        MODEL_CHECK(fabs((double)half[i] - f) <= bound + 2e-6, name, "error, bound", fabs((double)half[i] - f), bound);
+    }
+    for (size_t k = 0; k < sizeof sizes / sizeof *sizes; k++) {
+        memset(batch, 0xff, sizeof batch);
+        dist_field_eval(ctx, &field, sizes[k], points, batch, NULL);
+        MODEL_CHECK(memcmp(batch, half, sizes[k] * sizeof(float)) == 0, name, "other bits in a batch of", sizes[k], 0);
+    }
+    CHECK(net->layers < 3 || net->layer[0].out < 7 || memcmp(sdf, half, sizeof sdf) != 0);
+    dist_shape_destroy(shape);
+}
+
+TEST(every_form_of_file_in_16_bits_is_within_its_bound_and_the_same_bits_in_every_batch)
+{
+    NEEDS(has(DIST_HALF_F16) || has(DIST_HALF_BF16));
+    for (int j = 0; j < 2; j++) {
+        if (!has(kinds[j])) continue;
+        for (int k = 0; k < MODEL_CASES; k++) {
+            model m = model_make(&model_cases[k], 100u + (unsigned)k);
+            dist_context *ctx = test_context();
+            dist_net *net = model_load(ctx, &m);
+            if (net && net->sdf_channel >= 0 && !net->normed) check_net(ctx, net, kinds[j], m.desc.name);
+            dist_net_destroy(net);
+            dist_context_destroy(ctx);
+            model_free(&m);
+        }
+    }
+}
+
+TEST(ragged_widths_in_16_bits)
+{
+    static const int widths[] = {1, 2, 3, 7, 8, 9, 15, 31, 33, 64, 70, 127, 128, 129, 300};
+    NEEDS(has(DIST_HALF_F16) || has(DIST_HALF_BF16));
+    for (size_t k = 0; k < 2 * sizeof widths / sizeof *widths; k++) {
+        char name[32];
+        if (!has(kinds[k & 1])) continue;
+        dist_context *ctx = test_context();
+        dist_net_desc desc;
+        memset(&desc, 0, sizeof desc);
+        desc.layers = 3;
+        desc.width = widths[k / 2];
+        desc.skip = desc.width > 3 ? 2 : 0;
+        desc.code_size = desc.skip ? 2 : 0;
+        desc.seed = 9;
+        dist_net *net = dist_net_create(ctx, &desc);
+        snprintf(name, sizeof name, "width %d", desc.width);
+        check_net(ctx, net, kinds[k & 1], name);
+        dist_net_destroy(net);
+        dist_context_destroy(ctx);
+    }
+}
+
+static dist_net *small_net(dist_context *ctx)
+{
+    dist_net_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.layers = 3;
+    desc.width = 40;
+    desc.geometric = 1;
+    desc.output_linear = 1;
+    desc.seed = 3;
+    return dist_net_create(ctx, &desc);
+}
+
+/* Layer 0 times `factor`, layer 1's weights over it: ReLU nets stay the same function. */
+static void stretch(dist_context *ctx, dist_net *net, float factor)
+{
+    size_t n = dist_net_weight_count(net);
+    float *w = (float *)malloc(n * sizeof *w);
+    memcpy(w, dist_net_weights(net), n * sizeof *w);
+    for (size_t i = 0; i < net->layer[1].weight; i++) w[i] *= factor;
+    for (size_t i = net->layer[1].weight; i < net->layer[1].bias; i++) w[i] /= factor;
+    CHECK_STATUS(DIST_OK, dist_net_set_weights(ctx, net, w), ctx);
+    free(w);
+}
+
+TEST(blocks_that_overflow_f16_are_evaluated_in_f32)
+{
+    float points[3 * POINTS], sdf[POINTS], half[POINTS];
+    NEEDS(has(DIST_HALF_F16));
+    dist_context *ctx = test_context();
+    dist_net *net = small_net(ctx);
+    stretch(ctx, net, 3e6f); /* the point's columns stay in f32: only the sums are too large */
+    CHECK_STATUS(DIST_OK, dist_net_set_half(ctx, net, DIST_HALF_F16), ctx);
+    dist_shape *shape = dist_shape_create(ctx, net, NULL);
+    dist_field field = dist_shape_field(shape);
+    test_random random = test_random_seed(6);
+    test_random_fill(&random, 3 * POINTS, points, -0.6f, 0.6f);
+    dist_field_eval(ctx, &field, POINTS, points, sdf, NULL);
+    field.eval_fn = field.coarse_fn;
+    dist_field_eval(ctx, &field, POINTS, points, half, NULL);
+    CHECK(memcmp(sdf, half, sizeof sdf) == 0 && disti_finite_all(POINTS, half));
+    CHECK(field.coarse_error < 1e-2f); /* of the blocks of samples in which nothing overflows */
+    stretch(ctx, net, 1e-13f); /* now layer 1's weights are too large */
+    CHECK_EQUAL(DIST_HALF_OFF, dist_net_half(net));
+    dist_shape_set_code(shape, NULL);
+    dist_field_eval(ctx, &field, POINTS, points, half, NULL);
+    CHECK_NEAR_ARRAY(POINTS, sdf, half, 1e-5);
+    dist_shape_destroy(shape);
+    dist_net_destroy(net);
+    dist_context_destroy(ctx);
+}
+
+TEST(new_weights_are_packed_again_gradients_stay_exact_and_off_is_f32)
+{
+    float points[3 * POINTS], sdf[POINTS], half[POINTS], gradient[2][3 * POINTS];
+    NEEDS(has(DIST_HALF_F16));
+    dist_context *ctx = test_context();
+    dist_net *net = small_net(ctx);
+    CHECK_STATUS(DIST_OK, dist_net_set_half(ctx, net, DIST_HALF_F16), ctx);
+    dist_shape *shape = dist_shape_create(ctx, net, NULL);
+    dist_field field = dist_shape_field(shape), coarse = field;
+    coarse.eval_fn = field.coarse_fn;
+    test_random random = test_random_seed(6);
+    test_random_fill(&random, 3 * POINTS, points, -0.6f, 0.6f);
+    stretch(ctx, net, 2.0f);
+    dist_shape_set_code(shape, NULL);
+    dist_field_eval(ctx, &field, POINTS, points, sdf, gradient[0]);
+    dist_field_eval(ctx, &coarse, POINTS, points, half, NULL);
+    for (int i = 0; i < POINTS; i++) CHECK_NEAR((double)sdf[i], (double)half[i], 3e-3);
+    CHECK(memcmp(sdf, half, sizeof sdf) != 0);
+    dist_field_eval(ctx, &coarse, POINTS, points, half, gradient[1]);
+    CHECK(memcmp(gradient[0], gradient[1], sizeof gradient[0]) == 0);
+    CHECK_STATUS(DIST_OK, dist_net_set_half(ctx, net, DIST_HALF_OFF), ctx);
+    CHECK_EQUAL(DIST_HALF_OFF, dist_net_half(net));
+    dist_field_eval(ctx, &coarse, POINTS, points, half, NULL);
+    CHECK(memcmp(sdf, half, sizeof sdf) == 0);
+    CHECK(dist_shape_field(shape).coarse_fn == NULL);
+    dist_shape_destroy(shape);
+    dist_net_destroy(net);
+    dist_context_destroy(ctx);
+}
+
+TEST(what_has_no_16_bits_is_refused)
+{
+    dist_context *ctx = test_context();
+    dist_net *net = small_net(ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_net_set_half(NULL, net, DIST_HALF_F16), ctx);
+    refused(ctx, DIST_BAD_ARGUMENT, dist_net_set_half(ctx, NULL, DIST_HALF_F16), "net is NULL");
+    refused(ctx, DIST_BAD_ARGUMENT, dist_net_set_half(ctx, net, 4), "kind is 4");
+    refused(ctx, DIST_BAD_ARGUMENT, dist_net_set_half(ctx, net, -1), "kind is -1");
+    for (int j = 0; j < 2; j++)
+        if (!disti_cpu_half(kinds[j]))
+            refused(ctx, DIST_UNSUPPORTED, dist_net_set_half(ctx, net, kinds[j]), "arithmetic");
+    stretch(ctx, net, 1e-7f);
+    if (disti_cpu_half(DIST_HALF_F16))
+        refused(ctx, DIST_UNSUPPORTED, dist_net_set_half(ctx, net, DIST_HALF_F16), "65504");
+    if (disti_cpu_half(DIST_HALF_BF16)) {
+        CHECK_STATUS(DIST_OK, dist_net_set_half(ctx, net, DIST_HALF_AUTO), ctx);
+        CHECK_EQUAL(DIST_HALF_BF16, dist_net_half(net));
+    }
+    CHECK_EQUAL(DIST_HALF_OFF, dist_net_half(NULL));
+    dist_net_destroy(net);
+    for (int k = 0; k < MODEL_CASES; k++) {
+        if (!model_cases[k].normed) continue;
+        model m = model_make(&model_cases[k], 1);
+        net = model_load(ctx, &m);
+        for (int j = 0; j < 2; j++)
+            if (disti_cpu_half(kinds[j]))
+                refused(ctx, DIST_UNSUPPORTED, dist_net_set_half(ctx, net, kinds[j]), "LayerNorm");
+        dist_net_destroy(net);
+        model_free(&m);
+    }
+    dist_context_destroy(ctx);
+}
+
+TEST(another_instruction_set_has_no_coarse_fn)
+{
+    dist_context_desc desc;
+    NEEDS(has(DIST_HALF_F16));
+    memset(&desc, 0, sizeof desc);
+    desc.isa = DIST_ISA_AVX2;
+    dist_context *ctx = dist_context_create(&desc);
+    dist_net *net = small_net(ctx);
+    CHECK_STATUS(DIST_OK, dist_net_set_half(ctx, net, DIST_HALF_F16), ctx);
+    dist_shape *shape = dist_shape_create(ctx, net, NULL);
+    CHECK(dist_shape_field(shape).coarse_fn == NULL);
+    dist_shape_destroy(shape);
+    dist_net_destroy(net);
+    dist_context_destroy(ctx);
+}
+
+/* A picture all in 16 bits: what it hits is the surface to within epsilon and the error of the values. */
+TEST(a_picture_in_16_bits_is_off_by_no_more_than_its_values)
+{
+    enum { SIZE = 48 };
+    static float distance[SIZE * SIZE];
+    static unsigned char mask[SIZE * SIZE];
+    const float eye[3] = {0.0f, 0.5f, 2.5f}, at[3] = {0.0f, 0.0f, 0.0f}, up[3] = {0.0f, 1.0f, 0.0f};
+    NEEDS(has(DIST_HALF_F16) || has(DIST_HALF_BF16));
+    for (int j = 0; j < 2; j++) {
+        if (!has(kinds[j])) continue;
+        dist_context *ctx = test_context();
+        dist_net *net = small_net(ctx);
+        dist_net_set_half(ctx, net, kinds[j]);
+        dist_shape *shape = dist_shape_create(ctx, net, NULL);
+        dist_field field = dist_shape_field(shape), half = field;
+        half.eval_fn = field.coarse_fn;
+        half.fused_fn = NULL;
+        dist_camera camera = dist_camera_look_at(SIZE, SIZE, 0.7f, eye, at, up);
+        dist_images out;
+        memset(&out, 0, sizeof out);
+        out.distance = distance;
+        out.mask = mask;
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &half, &camera, NULL, &out, NULL), ctx);
+        int hits = 0;
+        for (int i = 0; i < SIZE * SIZE; i++) {
+            float o[3], d[3], f;
+            if (!mask[i]) continue;
+            dist_camera_ray(&camera, (float)(i % SIZE), (float)(i / SIZE), o, d);
+            for (int a = 0; a < 3; a++) o[a] += distance[i] * d[a];
+            dist_field_eval(ctx, &field, 1, o, &f, NULL);
+            CHECK_NEAR(0.0, (double)f, 1e-3 + 2.0 * (double)field.coarse_error);
+            hits++;
+        }
+        CHECK(hits > SIZE);
+        dist_shape_destroy(shape);
+        dist_net_destroy(net);
+        dist_context_destroy(ctx);
+    }
+}
+
+int main(int argc, char **argv)
+{
+    test_begin(argc, argv);
+    RUN(every_form_of_file_in_16_bits_is_within_its_bound_and_the_same_bits_in_every_batch);
+    RUN(ragged_widths_in_16_bits);
+    RUN(blocks_that_overflow_f16_are_evaluated_in_f32);
+    RUN(new_weights_are_packed_again_gradients_stay_exact_and_off_is_f32);
+    RUN(what_has_no_16_bits_is_refused);
+    RUN(another_instruction_set_has_no_coarse_fn);
+    RUN(a_picture_in_16_bits_is_off_by_no_more_than_its_values);
+    return test_report();
+}

@@ -205,8 +205,8 @@ typedef struct dist_field {
        dL/dweights of the net that gives the color. */
     void (*color_weights_fn)(void *user, dist_context *ctx, size_t n, const float *points, const float *d_color,
                              float *d_points, double *d_code, float *d_weights);
-    /* A cheaper eval_fn, off by about coarse_error at most, with the same arguments: field.eval_fn = field.coarse_fn takes
-       it for everything; gradients are the exact ones. Set by dist_shape_field after dist_net_set_half. */
+    /* A cheaper eval_fn, off by about coarse_error at most, with the same arguments: field.eval_fn = field.coarse_fn
+       takes it for everything; gradients are the exact ones. Set by dist_shape_field after dist_net_set_half. */
     void (*coarse_fn)(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient);
     float coarse_error;
     float center[3]; /* bounding sphere: the surface lies inside it, nothing is looked for outside */
@@ -353,9 +353,9 @@ enum {
     DIST_HALF_BF16  /* AVX512-BF16: 8 bits */
 };
 /* Packs the hidden layers' weights once more, in 16 bits: F16 at the size of the f32 ones, BF16 at half of it. Shapes
-   made afterwards have field.coarse_fn, and as field.coarse_error the largest difference to f32 met at 768 points of the
-   bounding sphere when the shape is made: a sample, not a proof. The point's columns and the last layer stay in f32; a
-   block in which anything overflows is evaluated in f32. DIST_UNSUPPORTED: a processor or build without these
+   made afterwards have field.coarse_fn, and as field.coarse_error the largest difference to f32 met at 768 points of
+   the bounding sphere when the shape is made: a sample, not a proof. The point's columns and the last layer stay in
+   f32; a block in which anything overflows is evaluated in f32. DIST_UNSUPPORTED: a processor or build without these
    instructions, LayerNorm, weights beyond 65504 in F16 (set later, they turn it off). Shapes on contexts of another isa
    than DIST_ISA_AVX512 have no coarse_fn. No shape of the net may be in use by another thread. */
 DIST_API dist_status dist_net_set_half(dist_context *ctx, dist_net *net, int kind);
@@ -6444,7 +6444,7 @@ static float disti_half_largest(const dist_net *net)
 }
 
 #ifdef DISTI_HALF
-DISTI_TARGET("f16c") static uint32_t disti_f16_bits(float x) { return (uint32_t)_cvtss_sh(x, 0); }
+DISTI_TARGET("f16c") static uint32_t disti_f16_bits(float x) { return (uint32_t)_mm_cvtsi128_si32(_mm_cvtps_ph(_mm_set_ss(x), 0)) & 0xffff; }
 #else
 static uint32_t disti_f16_bits(float x) { return (void)x, 0; } /* never: dist_net_set_half refuses */
 #endif

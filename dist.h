@@ -2519,6 +2519,19 @@ DISTI_KERNELS(neon, 8, 3)
 #endif
 #endif
 
+/* x to the nearest f16. */
+#ifdef DISTI_HALF
+DISTI_TARGET("f16c") static uint32_t disti_f16_bits(float x)
+{
+    return (uint32_t)_mm_cvtsi128_si32(_mm_cvtps_ph(_mm_set_ss(x), 0)) & 0xffff;
+}
+#else
+static uint32_t disti_f16_bits(float x) /* not called: dist_net_set_half refuses */
+{
+    return (void)x, 0;
+}
+#endif
+
 #define DISTI_TABLE(isa) \
     kernels.gemm = disti_gemm_##isa; \
     kernels.gemm_back = disti_gemm_back_##isa; \
@@ -6442,12 +6455,6 @@ static float disti_half_largest(const dist_net *net)
     }
     return largest;
 }
-
-#ifdef DISTI_HALF
-DISTI_TARGET("f16c") static uint32_t disti_f16_bits(float x) { return (uint32_t)_mm_cvtsi128_si32(_mm_cvtps_ph(_mm_set_ss(x), 0)) & 0xffff; }
-#else
-static uint32_t disti_f16_bits(float x) { return (void)x, 0; } /* never: dist_net_set_half refuses */
-#endif
 
 /* panels to half_panels, the previous units' columns: (w, w) in f16, rows 2 k and 2 k + 1 in bf16. */
 static void disti_half_pack(dist_net *net)

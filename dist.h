@@ -7981,19 +7981,27 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
 enum { DISTI_TILE = 64, DISTI_TILE_RAYS = (DISTI_TILE + 1) * (DISTI_TILE + 1) };
 
 /* Spheres that samples of the tile's rays prove empty, and the parts of each ray that those of the rays around it
-   cover. A ray that is about to step skips what is covered. Pool full: no more are kept. */
-enum { DISTI_POOL = 8192, DISTI_COVERS = 8 };
+   cover, looked up when it sets out. A ray that is about to step skips what is covered. Pool full: no more are kept. */
+enum { DISTI_POOL = 8192, DISTI_COVERS = 6 };
 
 typedef struct disti_cover {
-    float from[DISTI_COVERS], to[DISTI_COVERS]; /* disjoint, in no order; to = -3e38: free */
-    int seen;                                   /* balls up to this one are in it */
+    float begin, end;                           /* covered without a gap; what lies before is of no use */
+    float from[DISTI_COVERS], to[DISTI_COVERS]; /* beyond a gap: disjoint, in no order */
+    int beyond;                                 /* how many */
 } disti_cover;
 
+typedef struct disti_clear {
+    float center[3], square; /* of the radius */
+    int next;                /* the same pixel's next one, not larger in the picture */
+    int reach;               /* square of the radius in pixels, at most 255 */
+} disti_clear;
+
 typedef struct disti_balls {
-    int count, window;          /* window: pixels around a ray whose balls it looks at */
-    int head[DISTI_TILE_RAYS];  /* a pixel's newest ball; 0: none */
-    int next[DISTI_POOL];       /* the same pixel's next older one */
-    float ball[DISTI_POOL][4];  /* center, radius */
+    int count, stride, window;            /* rays look at every stride-th pixel less than window away */
+    int head[DISTI_TILE_RAYS];            /* a pixel's largest ball */
+    unsigned char reach[DISTI_TILE_RAYS]; /* its reach; 0: the pixel has none */
+    unsigned char looked[DISTI_TILE_RAYS]; /* the pixel's cover is filled in */
+    disti_clear ball[DISTI_POOL];
     disti_cover cover[DISTI_TILE_RAYS];
 } disti_balls;
 
@@ -8076,35 +8084,109 @@ static void disti_ray_point(const disti_ray *ray, float s, float p[3])
     for (int i = 0; i < 3; i++) p[i] = ray->origin[i] + s * ray->direction[i];
 }
 
-static void disti_publish(const disti_tracer *tracer, const disti_bench *bench, int index, const float *p, float f)
-{
-    disti_balls *balls = bench->balls;
-    float radius = disti_empty(tracer, f);
-    if (!(radius > bench->least) || balls->count + 1 >= DISTI_POOL) return;
-    float *ball = balls->ball[++balls->count];
-    memcpy(ball, p, 3 * sizeof(float));
-    ball[3] = radius;
-    balls->next[balls->count] = balls->head[index];
-    balls->head[index] = balls->count;
-}
-
-/* Adds [from, to] to what is covered; where all places are taken the farthest part gives way. */
+/* Adds [from, to] to the parts beyond the end; where all places are taken the farthest gives way. */
 static void disti_cover_add(disti_cover *cover, float from, float to)
 {
-    int place = -1, farthest = 0;
-    for (int i = 0; i < DISTI_COVERS; i++) {
+    int count = cover->beyond, farthest = 0;
+    for (int i = 0; i < count;) {
         if (cover->to[i] >= from && cover->from[i] <= to) { /* they meet: one */
             from = DISTI_MIN(from, cover->from[i]);
             to = DISTI_MAX(to, cover->to[i]);
-            cover->to[i] = -3e38f;
+            cover->from[i] = cover->from[--count];
+            cover->to[i] = cover->to[count];
+        } else {
+            i++;
         }
-        if (cover->to[i] < -1e38f) place = i;
-        else if (cover->from[i] > cover->from[farthest]) farthest = i;
     }
-    if (place < 0 && cover->from[farthest] <= from) return;
-    if (place < 0) place = farthest;
+    for (int i = 1; i < count; i++) farthest = cover->from[i] > cover->from[farthest] ? i : farthest;
+    cover->beyond = count;
+    if (count == DISTI_COVERS && cover->from[farthest] <= from) return;
+    int place = count < DISTI_COVERS ? cover->beyond++ : farthest;
     cover->from[place] = from;
     cover->to[place] = to;
+}
+
+static void disti_publish(const disti_tracer *tracer, const disti_bench *bench, int index, const float *p, float f)
+{
+    disti_balls *balls = bench->balls;
+    const disti_ray *ray = &bench->rays[index];
+    float radius = disti_empty(tracer, f);
+    if (!(radius > bench->least) || balls->count >= DISTI_POOL) return;
+    float pixels = radius / (((float)ray->base + ray->q) * ray->footprint * 2.0f);
+    disti_clear *ball = &balls->ball[balls->count];
+    memcpy(ball->center, p, 3 * sizeof(float));
+    ball->square = radius * radius;
+    ball->reach = pixels > 0.0f && pixels < 15.9f ? (int)(pixels * pixels) : 255;
+    int *at = &balls->head[index], left = balls->reach[index] > 0;
+    while (left && balls->ball[*at].reach >= ball->reach) {
+        at = &balls->ball[*at].next;
+        left = *at >= 0;
+    }
+    ball->next = left ? *at : -1;
+    *at = balls->count++;
+    balls->reach[index] = (unsigned char)DISTI_MAX(1, DISTI_MAX(ball->reach, (int)balls->reach[index]));
+    if (balls->looked[index]) disti_cover_add(&balls->cover[index], ray->q - radius, ray->q + radius);
+}
+
+/* Moves the cover's end to behind the parts that it meets, and drops these. */
+static float disti_cover_end(disti_cover *cover)
+{
+    for (int i = 0; i < cover->beyond;) {
+        if (cover->from[i] > cover->end) {
+            i++;
+            continue;
+        }
+        cover->end = DISTI_MAX(cover->end, cover->to[i]);
+        cover->from[i] = cover->from[--cover->beyond];
+        cover->to[i] = cover->to[cover->beyond];
+        i = 0;
+    }
+    return cover->end;
+}
+
+enum { DISTI_PARTS = 192 };
+
+/* Parts of the ray beyond the cover's end in a pixel's balls, those of at least this reach; added to the `count` in
+   parts. */
+static int disti_clear_parts(const disti_clear *pool, int i, int reach, const disti_ray *ray, const disti_cover *cover,
+                             float parts[DISTI_PARTS][2], int count)
+{
+    for (; i >= 0 && pool[i].reach >= reach && count < DISTI_PARTS; i = pool[i].next) {
+        const float *c = pool[i].center;
+        float d[3] = {c[0] - ray->origin[0], c[1] - ray->origin[1], c[2] - ray->origin[2]};
+        float along = d[0] * ray->direction[0] + d[1] * ray->direction[1] + d[2] * ray->direction[2];
+        float half = pool[i].square - (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] - along * along);
+        float ahead = cover->end - along;
+        if (!(half > 0.0f) || (ahead > 0.0f && half <= ahead * ahead)) continue;
+        half = sqrtf(half);
+        parts[count][0] = along - half;
+        parts[count++][1] = along + half;
+    }
+    return count;
+}
+
+/* Fills in the cover of a ray, whose end is where it sets out. */
+static void disti_cover_begin(const disti_bench *bench, int index, const disti_ray *ray, disti_cover *cover)
+{
+    const disti_balls *balls = bench->balls;
+    float parts[DISTI_PARTS][2], end = cover->end, before;
+    int x = index % bench->width, y = index / bench->width, h = balls->stride, window = balls->window, count = 0;
+    int x0 = DISTI_MAX(x - window + h, 0) / h * h, x1 = DISTI_MIN(x + window, bench->width - 1);
+    int y0 = DISTI_MAX(y - window + h, 0) / h * h, y1 = DISTI_MIN(y + window, bench->height - 1);
+    for (int v = y0; v <= y1; v += h) {
+        for (int u = x0; u <= x1; u += h) {
+            int at = v * bench->width + u, away = (u - x) * (u - x) + (v - y) * (v - y);
+            if (balls->reach[at] > 0 && balls->reach[at] >= away)
+                count = disti_clear_parts(balls->ball, balls->head[at], away, ray, cover, parts, count);
+        }
+    }
+    do {
+        before = end;
+        for (int i = 0; i < count; i++) end = parts[i][0] <= end ? DISTI_MAX(end, parts[i][1]) : end;
+    } while (end > before);
+    cover->end = end;
+    for (int i = 0; i < count; i++)
+        if (parts[i][0] > end) disti_cover_add(cover, parts[i][0], parts[i][1]);
 }
 
 /* How far along the ray the balls around it cover it without a gap, from s on. */
@@ -8112,27 +8194,13 @@ static float disti_covered(const disti_bench *bench, int index, const disti_ray 
 {
     disti_balls *balls = bench->balls;
     disti_cover *cover = &balls->cover[index];
-    int x = index % bench->width, y = index / bench->width, window = balls->window;
-    int x0 = DISTI_MAX(x - window, 0), x1 = DISTI_MIN(x + window, bench->width - 1);
-    int y0 = DISTI_MAX(y - window, 0), y1 = DISTI_MIN(y + window, bench->height - 1);
-    for (y = y0; y <= y1; y++) {
-        const int *head = balls->head + y * bench->width;
-        for (x = x0; x <= x1; x++) {
-            for (int i = head[x]; i > cover->seen; i = balls->next[i]) {
-                const float *ball = balls->ball[i];
-                float d[3] = {ball[0] - ray->origin[0], ball[1] - ray->origin[1], ball[2] - ray->origin[2]};
-                float along = d[0] * ray->direction[0] + d[1] * ray->direction[1] + d[2] * ray->direction[2];
-                float half = ball[3] * ball[3] - (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] - along * along);
-                if (!(half > 0.0f)) continue;
-                half = sqrtf(half);
-                if (along + half > s) disti_cover_add(cover, along - half, along + half);
-            }
-        }
-    }
-    cover->seen = balls->count;
-    for (int i = 0; i < DISTI_COVERS; i++)
-        if (s >= cover->from[i] && s < cover->to[i]) return cover->to[i];
-    return s;
+    int looked = balls->looked[index];
+    if (!looked || s < cover->begin || s > cover->end) cover->begin = cover->end = s;
+    if (looked) return disti_cover_end(cover);
+    cover->beyond = 0;
+    disti_cover_begin(bench, index, ray, cover);
+    balls->looked[index] = 1;
+    return cover->end;
 }
 
 /* Moves a ray that is about to step past what is known to be empty. 0: it is through. */
@@ -8836,18 +8904,16 @@ static float disti_pixel_width(const disti_tracer *tracer, const disti_tile *til
 static void disti_trace_lattice(const disti_tracer *tracer, int worker, const disti_tile *tile, disti_bench *bench)
 {
     size_t active = 0;
+    DIST_ASSERT(sizeof(disti_balls) <= DISTI_REST_BYTES);
     bench->balls = (disti_balls *)(void *)bench->rest;
     bench->width = tile->width;
     bench->height = tile->height;
     bench->least = 0.4f * disti_pixel_width(tracer, tile);
     bench->balls->count = 0;
+    bench->balls->stride = DISTI_LATTICE;
     bench->balls->window = 3;
-    memset(bench->balls->head, 0, sizeof bench->balls->head);
-    for (int i = 0; i < tile->width * tile->height; i++) {
-        disti_cover *cover = &bench->balls->cover[i];
-        for (int k = 0; k < DISTI_COVERS; k++) cover->from[k] = cover->to[k] = -3e38f;
-        cover->seen = 0;
-    }
+    memset(bench->balls->reach, 0, (size_t)(tile->width * tile->height));
+    memset(bench->balls->looked, 0, (size_t)(tile->width * tile->height));
     for (int i = 0; i < tile->width * tile->height; i++) {
         disti_ray *ray = &bench->rays[i];
         if (ray->mode == DISTI_DONE) continue;
@@ -8856,6 +8922,7 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
     }
     disti_trace_rounds(tracer, worker, bench, active);
     for (int h = DISTI_LATTICE / 2; h > 0; h /= 2) {
+        bench->balls->stride = h;
         bench->balls->window = DISTI_MIN(h + 3, 6);
         for (int pass = 1; pass <= 2; pass++) { /* between two known pixels, then amid four */
             active = 0;

@@ -7562,37 +7562,41 @@ static float disti_empty(const disti_tracer *tracer, float f)
     return (beyond > 0.0f ? tracer->far + beyond * tracer->ratio : f) / tracer->lipschitz;
 }
 
-/* center and direction (unit) of the ray in the field's space. The closest approach is found in double: a float's
-   squared distance is off by more than epsilon from 30 radii on. */
-static void disti_ray_init(const dist_field *field, const double center[3], const double direction[3], double footprint,
-                           disti_ray *ray)
+/* center (from the middle of the bounding sphere) and direction (unit) of the ray in the field's space; ray: zeroed.
+   The closest approach is found in double: a float's squared distance is off by more than epsilon from 30 radii on. */
+DISTI_INLINE void disti_ray_place(const dist_field *field, double cx, double cy, double cz, double dx, double dy,
+                                  double dz, double footprint, disti_ray *ray)
 {
-    double c[3], square = 0.0, radius = (double)field->radius;
-    memset(ray, 0, sizeof *ray);
-    for (int i = 0; i < 3; i++) c[i] = center[i] - (double)field->center[i];
-    double along = -disti_dot(c, direction);
-    for (int i = 0; i < 3; i++) {
-        double o = c[i] + along * direction[i];
-        square += o * o;
-        ray->origin[i] = (float)(o + (double)field->center[i]);
-        ray->direction[i] = (float)direction[i];
-    }
+    double radius = (double)field->radius, along = -(cx * dx + cy * dy + cz * dz);
+    double ox = cx + along * dx, oy = cy + along * dy, oz = cz + along * dz;
+    double half = radius * radius - (ox * ox + oy * oy + oz * oz);
+    ray->origin[0] = (float)(ox + (double)field->center[0]);
+    ray->origin[1] = (float)(oy + (double)field->center[1]);
+    ray->origin[2] = (float)(oz + (double)field->center[2]);
+    ray->direction[0] = (float)dx;
+    ray->direction[1] = (float)dy;
+    ray->direction[2] = (float)dz;
     ray->base = along;
     ray->cosine = 1.0f;
     ray->footprint = (float)footprint;
     ray->sign = 1.0f;
     ray->fbest = 3e38f;
-    double half = radius * radius - square;
     half = half > 0.0 ? sqrt(half) : -1.0;
-    ray->leave = (float)half;
-    ray->enter = (float)(-half > -along ? -half : -along); /* nothing behind the camera */
-    ray->s = ray->best = ray->enter;
+    float enter = (float)(-half > -along ? -half : -along), leave = (float)half; /* nothing behind the camera */
+    int meets = half > 0.0 && enter < leave;
+    ray->leave = meets ? leave : enter;
+    ray->enter = ray->s = ray->best = ray->start = ray->q = enter;
     ray->status = DIST_RAY_MISS;
-    ray->start = ray->enter;
     ray->guard = 3e38f;
-    ray->mode = half > 0.0 && ray->enter < ray->leave ? DISTI_FIRST : DISTI_DONE;
-    if (ray->mode == DISTI_DONE) ray->leave = ray->enter;
-    ray->q = ray->enter;
+    ray->mode = (unsigned char)(meets ? DISTI_FIRST : DISTI_DONE);
+}
+
+static void disti_ray_init(const dist_field *field, const double center[3], const double direction[3], double footprint,
+                           disti_ray *ray)
+{
+    memset(ray, 0, sizeof *ray);
+    disti_ray_place(field, center[0] - (double)field->center[0], center[1] - (double)field->center[1],
+                    center[2] - (double)field->center[2], direction[0], direction[1], direction[2], footprint, ray);
 }
 
 /* |f| that counts as the surface at s: epsilon, but no more than half a pixel there, and no less than float's noise. */
@@ -9660,8 +9664,8 @@ static void disti_render_pixel(const disti_render_job *job, const disti_ray *ray
     int placed = hit || ray->status == DIST_RAY_UNRESOLVED;
     double distance = ray->base + (double)ray->best, local[3];
     if (out->depth) {
-        if (placed) disti_view_direction(job->view, (int)(pixel % (size_t)job->view->width),
-                                         (int)(pixel / (size_t)job->view->width), local);
+        if (placed) disti_view_direction(job->view, (int)((unsigned)pixel % (unsigned)job->view->width),
+                                         (int)((unsigned)pixel / (unsigned)job->view->width), local);
         out->depth[pixel] = placed ? (float)(distance * local[2]) : tracer->how.background;
     }
     if (out->distance) out->distance[pixel] = placed ? (float)distance : tracer->how.background;
@@ -9700,6 +9704,37 @@ static void disti_ray_skip(disti_ray *ray)
     memset(ray, 0, sizeof *ray);
     ray->fbest = 3e38f;
     ray->status = DIST_RAY_SKIPPED; /* mode is DISTI_DONE, and the sphere is not met: enter = leave */
+}
+
+/* The rays of a tile, as disti_pixel_ray makes them. Off the box around the bounding sphere they miss; what else is to
+   be known of them is left out unless something is kept of misses. */
+static void disti_render_rays(const disti_render_job *job, const disti_tile *tile, disti_ray *ray)
+{
+    const disti_view *view = job->view;
+    const dist_field *field = job->tracer->field;
+    const double *m = view->rotation;
+    const unsigned char *pixels = job->tracer->how.pixels;
+    double c[3], per_pixel = disti_view_footprint(view, 1.0);
+    int all = job->least || job->tape || job->tracer->how.trace == DIST_TRACE_PAPER;
+    memset(ray, 0, (size_t)(tile->width * tile->height) * sizeof *ray);
+    for (int i = 0; i < 3; i++) c[i] = view->center[i] - (double)field->center[i];
+    for (int y = tile->y; y < tile->y + tile->height; y++) {
+        int out = !all && (y < job->box[1] || y >= job->box[3]);
+        double v = ((double)y + view->first - view->cy) / view->fy, skewed = view->cx + view->skew * v - view->first;
+        double row[3] = {m[3] * v + m[6], m[4] * v + m[7], m[5] * v + m[8]};
+        for (int x = tile->x; x < tile->x + tile->width; x++, ray++) {
+            if (pixels && !pixels[(size_t)y * (size_t)view->width + (size_t)x]) {
+                disti_ray_skip(ray);
+            } else if (out || (!all && (x < job->box[0] || x >= job->box[2]))) {
+                ray->fbest = 3e38f;
+            } else {
+                double u = ((double)x - skewed) / view->fx, cosine = 1.0 / sqrt(u * u + v * v + 1.0);
+                disti_ray_place(field, c[0], c[1], c[2], (m[0] * u + row[0]) * cosine, (m[1] * u + row[1]) * cosine,
+                                (m[2] * u + row[2]) * cosine, per_pixel * cosine * cosine, ray);
+                ray->cosine = (float)cosine;
+            }
+        }
+    }
 }
 
 /* Drops the extra column and row: what follows is about the tile's own pixels. */
@@ -10263,10 +10298,8 @@ static void disti_render_task(void *arg, int index, int worker)
 {
     const disti_render_job *job = (const disti_render_job *)arg;
     const disti_tracer *tracer = job->tracer;
-    const unsigned char *pixels = tracer->how.pixels;
     disti_bench bench;
     disti_tile tile;
-    double local[3];
     disti_bench_init(tracer->ctx, worker, &bench);
     tile.view = job->view;
     tile.list = NULL;
@@ -10281,12 +10314,7 @@ static void disti_render_task(void *arg, int index, int worker)
     if (predict && tile.x + tile.width < job->view->width) tile.width++;
     if (predict && tile.y + tile.height < job->view->height) tile.height++;
     int n = tile.width * tile.height;
-    for (int i = 0; i < n; i++) {
-        if (pixels && !pixels[disti_tile_pixel(&tile, i)]) disti_ray_skip(&bench.rays[i]);
-        else
-            disti_pixel_ray(job->view, tracer->field, tile.x + i % tile.width, tile.y + i / tile.width, local,
-                            &bench.rays[i]);
-    }
+    disti_render_rays(job, &tile, bench.rays);
 #ifndef DIST_NO_PAPER
     if (tracer->how.trace == DIST_TRACE_PAPER) {
         size_t first = (size_t)tile.y * (size_t)job->view->width + (size_t)tile.x;

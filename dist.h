@@ -8150,9 +8150,9 @@ static float disti_cover_end(disti_cover *cover)
 
 enum { DISTI_PARTS = 192 };
 
-/* Parts of the ray beyond the cover's end in a pixel's balls, those of at least this reach; added to the `count` in
-   parts. */
-static int disti_clear_parts(const disti_clear *pool, int i, int reach, const disti_ray *ray, const disti_cover *cover,
+/* Moves the cover's end through a pixel's balls, those of at least this reach; what they cover beyond a gap is added to
+   the `count` in parts. */
+static int disti_clear_parts(const disti_clear *pool, int i, int reach, const disti_ray *ray, disti_cover *cover,
                              float parts[DISTI_PARTS][2], int count)
 {
     for (; i >= 0 && pool[i].reach >= reach && count < DISTI_PARTS; i = pool[i].next) {
@@ -8163,6 +8163,10 @@ static int disti_clear_parts(const disti_clear *pool, int i, int reach, const di
         float ahead = cover->end - along;
         if (!(half > 0.0f) || (ahead > 0.0f && half <= ahead * ahead)) continue;
         half = sqrtf(half);
+        if (along - half <= cover->end) {
+            cover->end = along + half;
+            continue;
+        }
         parts[count][0] = along - half;
         parts[count++][1] = along + half;
     }
@@ -8173,7 +8177,7 @@ static int disti_clear_parts(const disti_clear *pool, int i, int reach, const di
 static void disti_cover_begin(const disti_bench *bench, int index, const disti_ray *ray, disti_cover *cover)
 {
     const disti_balls *balls = bench->balls;
-    float parts[DISTI_PARTS][2], end = cover->end, before;
+    float parts[DISTI_PARTS][2], before;
     int x = index % bench->width, y = index / bench->width, h = balls->stride, window = balls->window, count = 0;
     int x0 = DISTI_MAX(x - window + h, 0) / h * h, x1 = DISTI_MIN(x + window, bench->width - 1);
     int y0 = DISTI_MAX(y - window + h, 0) / h * h, y1 = DISTI_MIN(y + window, bench->height - 1);
@@ -8184,13 +8188,21 @@ static void disti_cover_begin(const disti_bench *bench, int index, const disti_r
                 count = disti_clear_parts(balls->ball, balls->head[at], away, ray, cover, parts, count);
         }
     }
-    do {
-        before = end;
-        for (int i = 0; i < count; i++) end = parts[i][0] <= end ? DISTI_MAX(end, parts[i][1]) : end;
-    } while (end > before);
-    cover->end = end;
-    for (int i = 0; i < count; i++)
-        if (parts[i][0] > end) disti_cover_add(cover, parts[i][0], parts[i][1]);
+    do { /* those that no gap is before any more; what is left of them */
+        int left = 0;
+        before = cover->end;
+        for (int i = 0; i < count; i++) {
+            if (parts[i][1] <= cover->end) continue;
+            if (parts[i][0] <= cover->end) {
+                cover->end = parts[i][1];
+                continue;
+            }
+            parts[left][0] = parts[i][0];
+            parts[left++][1] = parts[i][1];
+        }
+        count = left;
+    } while (cover->end > before);
+    for (int i = 0; i < count; i++) disti_cover_add(cover, parts[i][0], parts[i][1]);
 }
 
 /* How far along the ray the balls around it cover it without a gap, from s on. */
@@ -8918,11 +8930,13 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
     bench->balls->window = 3;
     memset(bench->balls->reach, 0, (size_t)(tile->width * tile->height));
     memset(bench->balls->looked, 0, (size_t)(tile->width * tile->height));
-    for (int i = 0; i < tile->width * tile->height; i++) {
-        disti_ray *ray = &bench->rays[i];
-        if (ray->mode == DISTI_DONE) continue;
-        if (i % tile->width % DISTI_LATTICE == 0 && i / tile->width % DISTI_LATTICE == 0) bench->index[active++] = i;
-        else ray->mode = DISTI_WAIT;
+    for (int i = 0, y = 0; y < tile->height; y++) {
+        for (int x = 0; x < tile->width; x++, i++) {
+            disti_ray *ray = &bench->rays[i];
+            if (ray->mode == DISTI_DONE) continue;
+            if (x % DISTI_LATTICE == 0 && y % DISTI_LATTICE == 0) bench->index[active++] = i;
+            else ray->mode = DISTI_WAIT;
+        }
     }
     disti_trace_rounds(tracer, worker, bench, active);
     for (int h = DISTI_LATTICE / 2; h > 0; h /= 2) {
@@ -8930,10 +8944,10 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
         bench->balls->window = DISTI_MIN(h + 3, 6);
         for (int pass = 1; pass <= 2; pass++) { /* between two known pixels, then amid four */
             active = 0;
-            for (int y = 0; y < tile->height; y += h) {
-                for (int x = 0; x < tile->width; x += h) {
+            for (int y = pass == 1 ? 0 : h; y < tile->height; y += pass == 1 ? h : 2 * h) {
+                for (int x = pass == 1 && y % (2 * h) != 0 ? 0 : h; x < tile->width; x += 2 * h) {
                     int index = y * tile->width + x;
-                    if ((x / h & 1) + (y / h & 1) != pass || bench->rays[index].mode != DISTI_WAIT) continue;
+                    if (bench->rays[index].mode != DISTI_WAIT) continue;
                     if (disti_predict(tracer, tile, bench, x, y, h)) bench->index[active++] = index;
                     else if (bench->budget) bench->budget->hits++;
                 }
@@ -9692,9 +9706,12 @@ static void disti_render_pixel(const disti_render_job *job, const disti_ray *ray
 
 static void disti_render_planes(const disti_render_job *job, const disti_tile *tile, const disti_bench *bench)
 {
-    for (int i = 0; i < tile->width * tile->height; i++) {
-        disti_stats_ray(job->tracer, &bench->rays[i], bench->stats);
-        disti_render_pixel(job, &bench->rays[i], disti_tile_pixel(tile, i));
+    for (int y = 0; y < tile->own_height; y++) {
+        for (int x = 0; x < tile->own_width; x++) {
+            int i = y * tile->width + x;
+            disti_stats_ray(job->tracer, &bench->rays[i], bench->stats);
+            disti_render_pixel(job, &bench->rays[i], disti_tile_pixel(tile, i));
+        }
     }
 }
 

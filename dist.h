@@ -9704,13 +9704,36 @@ static void disti_render_pixel(const disti_render_job *job, const disti_ray *ray
     job->tape->value[pixel] = ray->status != DIST_RAY_HIT ? ray->fbest : ray->sign > 0.0f ? ray->slope : 0.0f;
 }
 
+/* A run of pixels that see nothing and of which no silhouette and no tape wants to know more. */
+static void disti_render_nothing(const disti_render_job *job, size_t pixel, size_t count)
+{
+    const dist_images *out = job->out;
+    float background = job->tracer->how.background;
+    for (size_t i = 0; i < count && out->depth; i++) out->depth[pixel + i] = background;
+    for (size_t i = 0; i < count && out->distance; i++) out->distance[pixel + i] = background;
+    if (out->mask) memset(out->mask + pixel, 0, count);
+    if (out->status) memset(out->status + pixel, DIST_RAY_MISS, count);
+    if (out->error) memset(out->error + pixel, 0, count * sizeof(float));
+    if (out->normal) memset(out->normal + 3 * pixel, 0, 3 * count * sizeof(float));
+    for (size_t i = 0; i < count && out->color; i++)
+        memcpy(out->color + 3 * (pixel + i), job->tracer->how.background_color, 3 * sizeof(float));
+}
+
 static void disti_render_planes(const disti_render_job *job, const disti_tile *tile, const disti_bench *bench)
 {
+    int plain = !job->out->silhouette && !job->tape && !tile->list;
     for (int y = 0; y < tile->own_height; y++) {
-        for (int x = 0; x < tile->own_width; x++) {
-            int i = y * tile->width + x;
-            disti_stats_ray(job->tracer, &bench->rays[i], bench->stats);
-            disti_render_pixel(job, &bench->rays[i], disti_tile_pixel(tile, i));
+        const disti_ray *ray = bench->rays + y * tile->width;
+        for (int x = 0; x < tile->own_width;) {
+            size_t pixel = disti_tile_pixel(tile, y * tile->width + x), count = 0;
+            for (; plain && x < tile->own_width && ray->status == DIST_RAY_MISS; x++, ray++, count++)
+                bench->stats->rays_in_sphere += ray->enter < ray->leave;
+            bench->stats->rays += count;
+            if (count > 0) disti_render_nothing(job, pixel, count);
+            if (count > 0) continue;
+            disti_stats_ray(job->tracer, ray, bench->stats);
+            disti_render_pixel(job, ray++, pixel);
+            x++;
         }
     }
 }
@@ -9755,12 +9778,15 @@ static void disti_render_rays(const disti_render_job *job, const disti_tile *til
 }
 
 /* Drops the extra column and row: what follows is about the tile's own pixels. */
-static void disti_tile_trim(disti_tile *tile, const disti_bench *bench)
+static void disti_tile_trim(const disti_render_job *job, disti_tile *tile, const disti_bench *bench)
 {
-    for (int y = 0; y < tile->own_height && tile->width != tile->own_width; y++)
-        memmove(bench->rays + y * tile->own_width, bench->rays + y * tile->width,
-                (size_t)tile->own_width * sizeof(disti_ray));
-    tile->width = tile->own_width;
+    int w = tile->width, keeps = job->least || job->tape;
+    for (int y = 0; y < tile->own_height && w != tile->own_width; y++) {
+        disti_ray *row = bench->rays + y * w;
+        if (keeps) memmove(bench->rays + y * tile->own_width, row, (size_t)tile->own_width * sizeof(disti_ray));
+        else disti_ray_skip(row + w - 1); /* and the rows stay where they are */
+    }
+    if (keeps) tile->width = tile->own_width;
     tile->height = tile->own_height;
 }
 
@@ -10351,7 +10377,7 @@ static void disti_render_task(void *arg, int index, int worker)
         if (job->predict) disti_trace_lattice(tracer, worker, &tile, &bench);
         else disti_trace_all(tracer, worker, &bench, (size_t)n);
         budget.marching = 0;
-        disti_tile_trim(&tile, &bench);
+        disti_tile_trim(job, &tile, &bench);
         disti_trace_end(tracer, &bench, (size_t)(tile.width * tile.height));
         budget.left += kept;
         if (job->least) disti_silhouette(tracer, worker, &tile, &bench);
@@ -10403,7 +10429,7 @@ static void disti_render_list_task(void *arg, int index, int worker)
     size_t *list = (size_t *)(void *)(bench.rest + DISTI_REST_BYTES - DISTI_LIST_RAYS * sizeof(size_t));
     tile.view = job->view;
     tile.list = list;
-    tile.height = 1;
+    tile.height = tile.own_height = 1;
     for (size_t i = job->first[index]; i < job->first[index + 1];) {
         for (tile.width = 0; i < job->first[index + 1] && tile.width < DISTI_LIST_RAYS; i++) {
             disti_render_pixel(job, &skipped, i);
@@ -10417,6 +10443,7 @@ static void disti_render_list_task(void *arg, int index, int worker)
         done += (double)tile.width;
         disti_trace_all(tracer, worker, &bench, (size_t)tile.width);
         disti_trace_end(tracer, &bench, (size_t)tile.width);
+        tile.own_width = tile.width;
         disti_render_planes(job, &tile, &bench);
         if (job->out->normal) disti_render_normals(job, worker, &tile, &bench);
         if (job->out->color) disti_render_colors(job, worker, &tile, &bench);

@@ -206,11 +206,11 @@ static void write_tables(const results *r, int count, const job *jobs, int level
 
 int main(int argc, char **argv)
 {
-    static const float starts[] = {5, 10, 20, 30, 45, 60, 90, 120};
+    static const float starts[] = {5, 10, 20, 40, 60, 90};
     results r = results_options(argc, argv, results_usage);
     if (!results_wanted(&r, "pose")) { fail("--only takes pose"); }
-    int levels = r.quick ? 2 : 8;
-    int trials = r.quick ? 2 : 16;
+    int levels = r.quick ? 2 : 6;
+    int trials = r.quick ? 2 : 8;
     request base;
     memset(&base, 0, sizeof base);
     base.fit = fit_defaults();

@@ -27,11 +27,15 @@ columns photos part,family,target,seed,level,method,width,views,iterations,chamf
 columns pose degrees_start,distance_start,trial,shape,method,degrees_end,distance_end,found,explained
 columns pose_curve method,degrees_start,step,degrees_quarter,degrees_median
 
-for name in ladder marching threshold photos pose; do
-    grep -q "^## $(sed -n 's/^## //p' "$folder/$name.md" | head -n 1)\$" "$folder/RESULTS.md" &&
-        grep -q '</svg>' "$folder/$name.svg" && ok "section_and_plot_of_$name" ||
-        not_ok "section_and_plot_of_$name" "one of them is not there or not whole"
+for name in ladder marching threshold photos pose completion; do
+    [ -s "$folder/$name.csv" ] && [ -s "$folder/$name.svg" ] && ok "table_and_plot_of_$name" ||
+        not_ok "table_and_plot_of_$name" "one of them is not there"
 done
+for file in $(ls "$folder"/*.md | grep -v RESULTS); do
+    grep -q -x -F "$(grep -m 1 '^## ' "$file")" "$folder/RESULTS.md" || echo "$file is not in RESULTS.md"
+done >"$work/found"
+for file in "$folder"/*.svg; do tail -n 1 "$file" | grep -q '</svg>' || echo "$file has no end"; done >>"$work/found"
+expect_nothing sections_and_plots_are_whole "$work/found"
 [ -s "$folder/threshold.png" ] || [ -s "$folder/threshold.ppm" ] && ok picture_of_thresholds ||
     not_ok picture_of_thresholds "it is not there"
 

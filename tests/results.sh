@@ -39,7 +39,7 @@ expect_nothing sections_and_plots_are_whole "$work/found"
 [ -s "$folder/threshold.png" ] || [ -s "$folder/threshold.ppm" ] && ok picture_of_thresholds ||
     not_ok picture_of_thresholds "it is not there"
 
-# Every table: the machine first; rows as long as the heads; no cell empty, NaN or infinite.
+# Every table: the machine first; rows as long as the heads; nothing NaN or infinite (empty: not measured).
 for file in "$folder"/*.csv; do
     head -n 1 "$file" | grep -v -q '^# .* cores; .*; dist.h [0-9]' && echo "$file does not say where it was made"
     awk -F , -v file="$file" '/^#/ { next } { gsub(/"[^"]*"/, "text") } !n { n = NF; next }

@@ -906,7 +906,7 @@ static void ways_run(const bench *b, ways *v, const char *name)
         const trail *t = &v->trails[j];
         int i = j / v->recipe_count;
         for (int step = 0, k = 0; step <= b->s.iterations; step++) {
-            fprintf(f, "%s,%d,%s,%d,", shape_family_name(i % FAMILIES), b->s.first + i / FAMILIES,
+            fprintf(f, "%s,%d,\"%s\",%d,", shape_family_name(i % FAMILIES), b->s.first + i / FAMILIES,
                     v->recipes[j % v->recipe_count].name, step);
             if (step < b->s.iterations) { fprintf(f, "%.6g", t->image[step]); }
             int check = k < v->check_count && v->checks[k] == step;

@@ -6,7 +6,8 @@
 #   make torture        the table of hard cases in every instruction set, and 20,000 random scenes: about five minutes
 #   make matrix         the tests under every compiler, option and instruction set that this machine has
 #   make matrix-quick   the part of it that every change must pass
-#   make bench          the benchmarks in short, csv; build/bench_NAME --help tells what else they do
+#   make bench          the benchmarks in short, under ten minutes; CSV and plots also go to bench/results;
+#                       build/bench_NAME --help tells what else they do
 #   make results        the paper's tables and figures with ours beside them, into bench/results/: below an hour
 #   make results-quick  the same in small, into build/results/: a minute or two
 #   make clean
@@ -15,7 +16,7 @@ CC = cc
 CXX = c++
 CFLAGS = -O2
 DEMO_COMMAND = build/fit_depth --demo --out out/demo
-BENCH_COMMAND = for b in $(filter build/bench_%,$(BENCHES)); do echo "$$b"; ./$$b --quick || exit 1; done
+BENCH_COMMAND = CC="$(CC)" CFLAGS="$(CFLAGS)" sh bench/run.sh
 
 STRICT = -std=c99 -Wall -Wextra -Wpedantic -Wconversion -Wsign-conversion -Wshadow -Wcast-qual -Wundef \
          -Wdouble-promotion -Wmissing-prototypes -Werror
@@ -76,7 +77,7 @@ demo: build/fit_depth
 	@mkdir -p out
 	$(DEMO_COMMAND)
 
-bench: $(BENCHES)
+bench: $(filter-out $(RESULTS),$(BENCHES))
 	@$(BENCH_COMMAND)
 
 results: $(RESULTS)

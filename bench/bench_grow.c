@@ -3,12 +3,12 @@
    paper's tracer (coarse to fine, 50 steps) and ours, in turn within one loop. CSV on stdout, sums on stderr.
 
    A row is the median of `runs`, which are a third as many at 2048. speed_ratio and query_ratio: how many times less
-   time and queries than the paper's row beside it. differs: pixels per thousand of the larger picture that only one of the two says are hit; apart: mean
-   difference of their depths, in radii. The pictures are depth and mask alone, but for the views: a step of an
-   optimization from that many views, of depth, silhouette and mask, with the gradient for the code, which moves a
-   little from step to step; there `guarded, warm` starts from the last step's picture. Widths and depths are those of
-   ReLU nets made here that all are a sphere's distance, half of whose units are dead at a point. The camera is that of
-   bench_trace. */
+   time and queries than the paper's row beside it. differs: pixels per thousand of the larger picture that only one of
+   the two says are hit; apart: mean difference of their depths, in radii. The pictures are depth and mask alone, but
+   for the views: a step of an optimization from that many views, of depth, silhouette and mask, with the gradient for
+   the code, which moves a little from step to step; there `guarded, warm` starts from the last step's picture. Widths
+   and depths are those of ReLU nets made here that all are a sphere's distance, half of whose units are dead at a
+   point. The camera is that of bench_trace. */
 #define DIST_IMPLEMENTATION
 #include "../dist.h"
 #include "../examples/common.h"

@@ -29,7 +29,7 @@ typedef struct step_case {
 } step_case;
 
 static const step_case cases[] = {
-    {"deepsdf_512", "deepsdf_512", 0, 8, 512, 0},
+    {"deepsdf_512", "deepsdf_512", 0, 8, 512, 1},
     {"embedded", "embedded", 5, 0, 0, 1},
     {"bob_spot", "bob_spot", 1, 0, 0, 1},
     {"spot_geometry", "spot_geometry", 0, 0, 0, 0},

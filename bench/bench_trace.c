@@ -17,7 +17,7 @@ static const char usage[] =
     "  --steps N          of the paper's rows: 50 (default) or 100\n"
     "  --case NAME        without --ladder: only this one\n"
     "  --slow             also the decoders of 8 x 512 and with layer norm\n"
-    "  --quick            128 pixels, few cases\n";
+    "  --quick            128 and 512 pixels, few cases\n";
 
 typedef struct trace_case {
     const char *name, *net; /* net NULL: analytic, by its name */
@@ -78,7 +78,7 @@ static void run_case(dist_context *ctx, const trace_case *c, int quick)
     if (c->net && !net) { return; }
     dist_shape *shape = NULL;
     dist_field field = field_of(ctx, c->name, net, c->code, &shape);
-    for (int size = 128; size <= (quick ? 128 : 512); size *= 2) {
+    for (int size = 128; size <= 512; size *= quick ? 4 : 2) {
         dist_camera camera = bench_camera(&field, size, size);
         reference ref = reference_create(ctx, &field, &camera);
         for (int m = FIRST_SHORT; m < METHODS; m++) {

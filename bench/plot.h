@@ -229,7 +229,7 @@ static inline void plot_number(FILE *f, double value, int plain)
     double size = fabs(value);
     double exponent = size > 0 ? floor(log10(size) + 1e-9) : 0;
     if (plain || value == 0) {
-        fprintf(f, "%.4g", value);
+        fprintf(f, "%.6g", value);
         return;
     }
     double digits = value / pow(10, exponent);
@@ -363,10 +363,17 @@ static inline void plot_axes(FILE *f, const plot_panel *a)
     int n = plot_ticks(a, 0, ticks);
     int plain = 1; /* all numbers of an axis alike */
     for (int i = 0; i < n; i++) { plain &= plot_is_plain(ticks[i]); }
+    double taken = -1e30; /* up to here by the last number */
     for (int i = 0; i < n; i++) {
+        char number[32];
+        snprintf(number, sizeof number, "%.6g", ticks[i]);
+        double exponent = log10(fabs(ticks[i]) + 1e-300);
+        int round = fabs(exponent - floor(exponent + 0.5)) < 1e-6;
+        double half = plain ? 0.5 * plot_text_width(number, 11) : round ? 14 : 24;
         double x = plot_at(a, 0, ticks[i]);
         fprintf(f, "<path d='M%.1f %.1fV%.1f' stroke='#e4e4e4'/>", x, a->top, bottom);
-        if (a->edge[0] && x < a->left + 28) { continue; } /* the edge's own word is there */
+        if ((a->edge[0] && x < a->left + 28) || x - half < taken + 4) { continue; } /* the edge's own word is there */
+        taken = x + half;
         fprintf(f, "<text x='%.1f' y='%.1f' text-anchor='middle'>", x, bottom + 15);
         plot_number(f, ticks[i], plain);
         fputs("</text>\n", f);

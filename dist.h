@@ -9796,15 +9796,14 @@ static void disti_tile_trim(const disti_render_job *job, disti_tile *tile, const
    are. A quarter of them takes one query there (a step of Newton's with the last slope ends it, as for a cold
    prediction); the others lie between such that moved alike, and are moved with them, else they take a query, too. The
    quarters take turns, so no error lives longer than three turns.
-   Misses. Where the cones stopped again,
-       f at the sample of least |f| must stay above the largest change of f seen in the
-   tile; it is asked again when 1.5 times that change, taken off each turn, may have brought it near.
-   A hit that has a nearer one beside it, not of the same slant, may be covered by that: f must stay above the largest
-   change, too, from the nearer one's distance on until it rises.
+   Misses. Where the cones stopped again, the least |f| is known to within what the largest change of f seen in the tile
+   takes off it each turn. Once that may have brought it near, f is asked for where it was least, and when it is near,
+   by samples on both sides how low it is now: a crossing is bracketed on the spot, what stays undecided is marched.
+   What has a nearer hit beside it, not of the same slant, may be covered by that: from the nearer one's distance on,
+   the least f is looked for likewise; misses take turns at it.
    All is off for rays where f at the cones' stop is too small for the surface expected (as in disti_predict) and the
-   cones prove less to be empty than when the ray was traced,
-       and for tiles where the pixels marched anew (one hit in 128
-   each turn) or the first ones contradict what is expected. */
+   cones prove less to be empty than when the ray was traced, and for tiles where the pixels marched anew (one hit in
+   128 each turn) or the first ones contradict what is expected. */
 enum { DISTI_WARM_HITS = 128, DISTI_WARM_MISSES = 64, DISTI_WARM_MINIMA = 8 };
 
 typedef struct disti_warm {
@@ -9904,7 +9903,8 @@ static void disti_warm_newton(disti_warm *warm)
             ray->slope = slope;
             ray->a = ray->q;
             ray->q += step;
-            if (good && length <= (round == 0 ? 4.0f : 12.0f) * epsilon) {
+            int steep = slope < -0.3f * warm->tracer->lipschitz;
+            if (good && length <= (round > 0 ? 12.0f : steep ? 8.0f : 4.0f) * epsilon) {
                 disti_warm_hit(warm, i, ray->q, f, 2.0f * length);
                 disti_warm_change(warm, moved * slope);
             } else if (good && round < 3) {
@@ -10002,7 +10002,7 @@ static int disti_warm_hits(disti_warm *warm)
             sum += change < 0.0f ? -change : change;
             good++;
         }
-        if (4 * good < 3 * tried || sum > 4e-3f * warm->tracer->field->radius * (float)good) return 0;
+        if (4 * good < 3 * tried || sum > 8e-3f * warm->tracer->field->radius * (float)good) return 0;
     }
     return 1;
 }
@@ -10071,9 +10071,9 @@ static void disti_warm_near(disti_warm *warm, size_t count)
             int i = bench->index[k], more;
             disti_ray *ray = &bench->rays[i];
             float f = round == 0 ? ray->f : bench->sdf[k];
-            float least = 2.0f * disti_ray_epsilon(warm->tracer, ray, ray->s);
+            float least = 2.0f * disti_ray_epsilon(warm->tracer, ray, ray->s) + 0.1f * warm->change;
             if (round == 0) {
-                ray->width = DISTI_MAX(0.5f * f, 2e-3f * warm->tracer->field->radius);
+                ray->width = DISTI_MAX(f, 2e-3f * warm->tracer->field->radius);
                 ray->side = 0;
                 ray->steps = 0;
                 ray->q = ray->s;
@@ -10150,7 +10150,7 @@ static void disti_warm_misses(disti_warm *warm)
         int i = bench->index[k];
         disti_ray *ray = &bench->rays[i];
         float f = bench->sdf[k], epsilon = disti_ray_epsilon(warm->tracer, ray, ray->best);
-        float margin = 3.0f * (warm->change + epsilon);
+        float margin = 2.0f * (warm->change + epsilon);
         if (!(warm->tape->value[disti_warm_pixel(warm, i)] > 0.0f)) margin += 0.03f * field->radius;
         ray->fbest = ray->f = f;
         ray->s = ray->best;

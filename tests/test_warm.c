@@ -169,6 +169,7 @@ TEST(outlines_that_pass_each_other_are_followed)
             queries += warm.stats.queries;
             all += cold.stats.queries;
         }
+        CHECK(queries < all * 7 / 10);
         scene_close(&s);
     }
 }

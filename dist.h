@@ -10150,8 +10150,9 @@ static void disti_warm_misses(disti_warm *warm)
         int i = bench->index[k];
         disti_ray *ray = &bench->rays[i];
         float f = bench->sdf[k], epsilon = disti_ray_epsilon(warm->tracer, ray, ray->best);
-        float margin = 2.0f * (warm->change + epsilon);
-        if (!(warm->tape->value[disti_warm_pixel(warm, i)] > 0.0f)) margin += 0.03f * field->radius;
+        float margin = 5.0f * (warm->change + epsilon); /* without a silhouette the bound is used up: a new one */
+        int bounded = warm->silhouette && warm->tape->value[disti_warm_pixel(warm, i)] > 0.0f;
+        if (!bounded) margin += 0.03f * field->radius;
         ray->fbest = ray->f = f;
         ray->s = ray->best;
         if (f > margin) {

@@ -959,6 +959,9 @@ struct dist_context {
     size_t lane_bytes;      /* of each worker, a multiple of DISTI_ALIGNMENT */
     double *partial;        /* DISTI_SLOTS * partial_size: sums of each slot, added in slot order */
     size_t partial_size;
+    float *store;           /* what weight gradients keep of some blocks; of the shape that asked last, store_user */
+    size_t store_size;
+    const void *store_user;
 };
 
 enum {
@@ -1340,6 +1343,22 @@ static dist_status disti_partial_for(dist_context *ctx, size_t codes)
     return disti_partial_reserve(ctx, codes + codes / DISTI_SLOTS + 1);
 }
 
+#ifndef DIST_NO_TRAIN
+static dist_status disti_store_reserve(dist_context *ctx, size_t size)
+{
+    size_t bytes;
+    if (size <= ctx->store_size) return DIST_OK;
+    if (!disti_size_mul(size, sizeof(float), &bytes)) bytes = (size_t)-1;
+    float *store = (float *)disti_alloc(ctx, bytes);
+    if (!store) return DIST_OUT_OF_MEMORY;
+    disti_free(ctx, ctx->store, ctx->store_size * sizeof(float));
+    ctx->store = store;
+    ctx->store_size = size;
+    ctx->store_user = NULL;
+    return DIST_OK;
+}
+#endif
+
 /* C (3, 4) = 2 A B + 3 C in all four transpositions, against plain loops; small integers, so every right BLAS is
    exact. */
 static int disti_blas_works(const dist_blas *blas)
@@ -1445,6 +1464,7 @@ DIST_API dist_context *dist_context_create(const dist_context_desc *desc)
 DIST_API void dist_context_destroy(dist_context *ctx)
 {
     if (!ctx) return;
+    disti_free(ctx, ctx->store, ctx->store_size * sizeof(float));
     disti_free(ctx, ctx->partial, ctx->partial_size * DISTI_SLOTS * sizeof(double));
     disti_free(ctx, ctx->lanes, ctx->lane_bytes * (size_t)ctx->workers);
     disti_free(ctx, ctx->scratch, (size_t)DISTI_SCRATCH_BYTES * (size_t)ctx->workers);
@@ -4907,8 +4927,7 @@ struct dist_shape {
     float half_error; /* largest of 16 bits at the samples of disti_shape_slope */
     uint32_t all_alive; /* bit l: the samples of disti_shape_slope met no dead unit at layer l's input */
     dist_shape *texture; /* the net that colors it, with [code, color code] folded in; NULL: none */
-    float *store; /* activations and deltas of store_blocks blocks, for weight gradients */
-    size_t store_block_size;
+    size_t store_block_size; /* of activations and deltas, for weight gradients; ctx->store holds store_blocks */
     int store_blocks;
 };
 
@@ -5860,7 +5879,7 @@ static void disti_weights_block(void *arg, int index, int worker)
     disti_block b;
     size_t at = job->first + (size_t)index * job->block;
     size_t count = DISTI_MIN(job->n - at, job->block);
-    float *store = shape->store + (size_t)index * shape->store_block_size;
+    float *store = shape->ctx->store + (size_t)index * shape->store_block_size;
     const float *pull;
     if (job->directions) {
         pull = disti_second_block(shape, worker, &b, count, job->points + 3 * at, job->directions + 3 * at, store);
@@ -5905,7 +5924,7 @@ static void disti_weights_rows(const disti_weights_job *job, int l, size_t o, si
     const dist_net *net = shape->net;
     const disti_linear *layer = &net->layer[l];
     disti_kernels kernels = disti_kernels_for(shape->ctx->isa);
-    const float *store = shape->store + (size_t)index * shape->store_block_size;
+    const float *store = shape->ctx->store + (size_t)index * shape->store_block_size;
     const float *xt = store + disti_store_offset(net, l, DISTI_STORE_INPUT);
     const float *delta = store + disti_store_offset(net, l, DISTI_STORE_DELTA) + o * DISTI_BLOCK;
     size_t row = l + 1 == net->layers ? (size_t)disti_weights_channel(job) : o;
@@ -5972,6 +5991,9 @@ static void disti_weights_run(disti_weights_job *job, dist_context *ctx, double 
     for (int l = 0; l + 1 < net->layers; l++) tasks += (net->layer[l].out + DISTI_WEIGHT_ROWS - 1) / DISTI_WEIGHT_ROWS;
     job->block = job->directions ? DISTI_BLOCK / 2 : DISTI_BLOCK;
     job->d_code = d_code ? ctx->partial : NULL;
+    if (ctx->store_user != shape) /* rows and columns that only fill up stay 0 */
+        memset(ctx->store, 0, (size_t)shape->store_blocks * shape->store_block_size * sizeof(float));
+    ctx->store_user = shape;
     for (; job->first < job->n; job->first += (size_t)shape->store_blocks * job->block) {
         size_t left = (job->n - job->first + job->block - 1) / job->block;
         job->blocks = left < (size_t)shape->store_blocks ? (int)left : shape->store_blocks;
@@ -6207,7 +6229,7 @@ DIST_API void dist_shape_destroy(dist_shape *shape)
     dist_context *ctx = shape->ctx;
     const dist_net *net = shape->net;
     dist_shape_destroy(shape->texture);
-    disti_free(ctx, shape->store, (size_t)shape->store_blocks * shape->store_block_size * sizeof(float));
+    if (ctx->store_user == shape) ctx->store_user = NULL;
     disti_free(ctx, shape->bias, (size_t)(net->layers + 1) * (size_t)net->max_rows * sizeof(float));
     disti_free(ctx, shape->code, (size_t)net->code_size * sizeof(float));
     disti_free(ctx, shape, sizeof *shape);
@@ -6232,8 +6254,7 @@ static dist_status disti_shape_take(dist_shape *shape)
         size_t blocks = ((size_t)4 << 20) / (block * sizeof(float));
         shape->store_block_size = block;
         shape->store_blocks = (int)(blocks < 2 ? 2 : blocks > 32 ? 32 : blocks);
-        shape->store = (float *)disti_alloc(ctx, (size_t)shape->store_blocks * block * sizeof(float));
-        if (!shape->store) return DIST_OUT_OF_MEMORY;
+        return disti_store_reserve(ctx, (size_t)shape->store_blocks * block);
     }
 #endif
     return DIST_OK;
@@ -6253,7 +6274,6 @@ DIST_API dist_shape *dist_shape_create(dist_context *ctx, const dist_net *net, c
     shape->net = net;
     if (disti_shape_take(shape) != DIST_OK) goto fail;
     memset(shape->bias, 0, (size_t)(net->layers + 1) * (size_t)net->max_rows * sizeof(float));
-    if (shape->store) memset(shape->store, 0, (size_t)shape->store_blocks * shape->store_block_size * sizeof(float));
     if (dist_shape_set_code(shape, code) != DIST_OK) goto fail;
     shape->lipschitz = shape->lipschitz_far = 1.0f;
     if (net->sdf_channel >= 0) {

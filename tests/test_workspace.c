@@ -310,8 +310,52 @@ TEST(what_cannot_be_made_has_no_bytes_and_a_sentence)
     model_free(&m);
 }
 
-/* Eight layers of 512 and a code of 256, as DeepSDF; camera: a tape for it. Without net. */
-static size_t deepsdf_bytes(const dist_net *net, int workers, int side, const dist_render_desc *how)
+/* They share what they keep for it; what one leaves there must not reach another's. */
+TEST(shapes_in_turn_have_the_weight_gradients_that_each_has_alone)
+{
+    enum { MOST = 9000, POINTS = 150 };
+    static float gradient[3][2][MOST], points[3 * POINTS], seeds[POINTS];
+    test_random r = test_random_seed(3);
+    test_random_fill(&r, 3 * POINTS, points, -0.6f, 0.6f);
+    memset(gradient, 0, sizeof gradient);
+    for (int mode = 0; mode < 3; mode++) { /* only one, only the other, both in turn */
+        dist_context *ctx = test_context();
+        dist_net *nets[2];
+        dist_shape *shapes[2];
+        for (int which = 0; which < 2; which++) {
+            model m = model_make(&model_cases[MODEL_CASES - 1 - which], 7);
+            nets[which] = model_load(ctx, &m);
+            shapes[which] = dist_shape_create(ctx, nets[which], NULL);
+            model_free(&m);
+        }
+        for (int turn = 0; turn < 4; turn++) {
+            int which = mode < 2 ? mode : turn & 1;
+            dist_field field = dist_shape_field(shapes[which]);
+            dist_gradients grads;
+            memset(&grads, 0, sizeof grads);
+            REQUIRE(field.weight_count <= MOST);
+            grads.weights = gradient[mode][which];
+            memset(grads.weights, 0, sizeof gradient[0][0]);
+            for (int i = 0; i < POINTS; i++) seeds[i] = (float)(i % 7) - 3.0f;
+            CHECK_STATUS(DIST_OK,
+                         dist_field_backward(ctx, &field, POINTS, points, seeds, NULL, NULL, NULL, &grads), ctx);
+        }
+        for (int which = 0; which < 2; which++) {
+            dist_shape_destroy(shapes[which]);
+            dist_net_destroy(nets[which]);
+        }
+        dist_context_destroy(ctx);
+    }
+    for (int which = 0; which < 2; which++) {
+        double sum = 0;
+        for (int i = 0; i < MOST; i++) sum += fabs((double)gradient[which][which][i]);
+        CHECK(sum > 1);
+        CHECK_BYTES(sizeof gradient[0][0], gradient[which][which], gradient[2][which]);
+    }
+}
+
+/* With a net that is there; how: a tape for a picture of that side. */
+static size_t net_bytes(const dist_net *net, int workers, int shapes, int side, const dist_render_desc *how)
 {
     dist_context_desc context = test_context_desc();
     dist_workspace_desc d;
@@ -325,6 +369,7 @@ static size_t deepsdf_bytes(const dist_net *net, int workers, int side, const di
     d.net = net;
     d.camera = how ? &camera : NULL;
     d.how = how;
+    d.shapes = shapes;
     return dist_workspace_bytes(&d);
 }
 
@@ -340,14 +385,15 @@ TEST(memory_is_that_of_tiles_without_a_tape_and_a_few_bytes_a_pixel_with_one)
     dist_net *net = dist_net_create(ctx, &desc);
     REQUIRE(net != NULL);
     double pixels = 2048.0 * 2048.0;
-    size_t none = deepsdf_bytes(net, 2, 1, NULL), small = deepsdf_bytes(net, 2, 256, &how);
-    size_t large = deepsdf_bytes(net, 2, 2048, &how);
+    size_t none = net_bytes(net, 2, 1, 1, NULL), small = net_bytes(net, 2, 1, 256, &how);
+    size_t large = net_bytes(net, 2, 1, 2048, &how);
     CHECK((double)none < 10e6);
     CHECK((double)large < 32e6);
     CHECK_NEAR(5.0 * (pixels - 256.0 * 256.0), large - small, 0);
-    CHECK((double)(deepsdf_bytes(net, 3, 1, NULL) - none) < 2.2e6); /* another worker */
+    CHECK((double)(net_bytes(net, 3, 1, 1, NULL) - none) < 2.2e6); /* another worker */
+    CHECK((double)(net_bytes(net, 2, 101, 1, NULL) - none) < 100 * 32e3); /* another shape: its code and biases */
     how.warm_start = 1;
-    CHECK_NEAR((double)large + 12.0 * pixels, deepsdf_bytes(net, 2, 2048, &how), 0);
+    CHECK_NEAR((double)large + 12.0 * pixels, net_bytes(net, 2, 1, 2048, &how), 0);
     dist_net_destroy(net);
     dist_context_destroy(ctx);
 }
@@ -389,6 +435,7 @@ int main(int argc, char **argv)
     test_begin(argc, argv);
     RUN(an_arena_of_exactly_so_many_bytes_suffices);
     RUN(what_cannot_be_made_has_no_bytes_and_a_sentence);
+    RUN(shapes_in_turn_have_the_weight_gradients_that_each_has_alone);
     RUN(memory_is_that_of_tiles_without_a_tape_and_a_few_bytes_a_pixel_with_one);
     RUN(a_large_picture_without_a_tape_takes_no_more_memory_than_a_small_one);
     return test_report();

@@ -35,4 +35,5 @@ table() {
 
 echo "target,left out,bytes,saved"
 table x86-64 "${CC:-cc}"
+table cortex-m4 arm-none-eabi-gcc -mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16
 table cortex-m7 arm-none-eabi-gcc -mcpu=cortex-m7 -mthumb -mfloat-abi=hard -mfpu=fpv5-d16

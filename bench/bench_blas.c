@@ -4,7 +4,9 @@
    (libopenblas-dev, libdnnl-dev); set OPENBLAS_CORETYPE=SkylakeX where OpenBLAS does not know the processor.
 
    dist: dist_field_eval of a whole net, no BLAS. hook: the same with the BLAS as dist_context_desc.blas. kernels, blas,
-   onednn: the square layers alone, each as y = relu(W x + b), the libraries at the batch that suits them best. */
+   onednn: the square layers alone, each as y = relu(W x + b), the libraries at the batch that suits them best.
+   hook and blas take turns, and their times are medians: stderr has the rate of one over that of the other, the
+   median, the first and the last quarter of all turns. */
 #define DIST_IMPLEMENTATION
 #include "../dist.h"
 #include "../examples/common.h"
@@ -256,7 +258,15 @@ static void chain_once(void *work)
 }
 
 /* The net by dist_field_eval, every unit alive; with_hook: through the BLAS. Counts all its multiply-adds. */
-static void measure_dist(const settings *s, const net_case *c, int with_hook, double *peak)
+typedef struct dist_work {
+    eval_work w;
+    dist_net *net;
+    dist_shape *shape;
+    float *points;
+    double operations;
+} dist_work;
+
+static void dist_begin(dist_work *d, const net_case *c, int with_hook)
 {
     dist_context_desc context;
     dist_net_desc desc;
@@ -266,33 +276,75 @@ static void measure_dist(const settings *s, const net_case *c, int with_hook, do
 #ifdef WITH_CBLAS
     if (with_hook) { context.blas.sgemm_fn = hook_sgemm; }
 #endif
-    eval_work w;
-    w.ctx = dist_context_create(&context);
+    d->w.ctx = dist_context_create(&context);
     desc.layers = c->layers;
     desc.width = c->width;
     desc.seed = 1;
-    dist_net *net = dist_net_create(w.ctx, &desc);
-    check(w.ctx);
-    make_alive(w.ctx, net);
-    dist_shape *shape = dist_shape_create(w.ctx, net, NULL);
-    check(w.ctx);
-    w.field = dist_shape_field(shape);
-    float *points = take_floats((size_t)3 * LARGEST);
+    d->net = dist_net_create(d->w.ctx, &desc);
+    check(d->w.ctx);
+    make_alive(d->w.ctx, d->net);
+    d->shape = dist_shape_create(d->w.ctx, d->net, NULL);
+    check(d->w.ctx);
+    d->w.field = dist_shape_field(d->shape);
+    d->points = take_floats((size_t)3 * LARGEST);
     rng r = rng_begin(1);
     for (size_t i = 0; i < (size_t)3 * LARGEST; i++) {
-        points[i] = 1.1f * rng_uniform(&r) - 0.55f;
+        d->points[i] = 1.1f * rng_uniform(&r) - 0.55f;
     }
-    w.points = points;
-    w.sdf = take_floats(LARGEST);
-    double seconds = work_seconds(w.ctx, eval_once, &w, s, peak);
-    print_row(c->name, with_hook ? "hook" : "dist", LARGEST, seconds, (double)dist_net_operations(net, 1), *peak);
-    check(w.ctx);
-    free(points);
-    free(w.sdf);
-    dist_shape_destroy(shape);
-    dist_net_destroy(net);
-    dist_context_destroy(w.ctx);
+    d->w.points = d->points;
+    d->w.sdf = take_floats(LARGEST);
+    d->operations = (double)dist_net_operations(d->net, 1);
 }
+
+static void dist_end(dist_work *d)
+{
+    check(d->w.ctx);
+    free(d->points);
+    free(d->w.sdf);
+    dist_shape_destroy(d->shape);
+    dist_net_destroy(d->net);
+    dist_context_destroy(d->w.ctx);
+}
+
+static void measure_dist(const settings *s, const net_case *c, double *peak)
+{
+    dist_work d;
+    dist_begin(&d, c, 0);
+    double seconds = work_seconds(d.w.ctx, eval_once, &d.w, s, peak);
+    print_row(c->name, "dist", LARGEST, seconds, d.operations, *peak);
+    dist_end(&d);
+}
+
+#ifdef WITH_CBLAS
+/* The net through the hook and the chain by the BLAS itself, in turn. */
+static void measure_hook(const settings *s, const net_case *k, chain *c, double *peak)
+{
+    enum { MOST = 1001 };
+    static double times[2][MOST], ratio[MOST];
+    dist_work d;
+    dist_begin(&d, k, 1);
+    eval_once(&d.w);
+    chain_once(c);
+    int passes = LARGEST / c->batch, turns = s->quick ? 5 : s->repetitions;
+    for (int r = 0; r < turns; r++) {
+        double start = now_of(d.w.ctx);
+        eval_once(&d.w);
+        double middle = now_of(d.w.ctx);
+        for (int i = 0; i < passes; i++) {
+            chain_once(c);
+        }
+        times[0][r] = middle - start;
+        times[1][r] = now_of(d.w.ctx) - middle;
+        ratio[r] = times[1][r] / times[0][r] * d.operations / chain_operations(c);
+    }
+    print_row(k->name, "hook", LARGEST, median((size_t)turns, times[0]), d.operations, *peak);
+    print_row(k->name, "blas", c->batch, median((size_t)turns, times[1]) / passes, chain_operations(c), *peak);
+    double half = median((size_t)turns, ratio); /* sorts */
+    fprintf(stderr, "%s: the hook has %.3f times the rate of the BLAS alone (%.3f to %.3f)\n", k->name, half,
+            ratio[turns / 4], ratio[turns - 1 - turns / 4]);
+    dist_end(&d);
+}
+#endif
 
 enum { KERNELS, CBLAS, DNNL };
 
@@ -343,7 +395,12 @@ static void measure_chain(const settings *s, const net_case *k, int library, dou
 #endif
     }
     static const char *const names[] = {"kernels", "blas", "onednn"};
-    print_row(k->name, names[library], best_batch, best * best_batch, chain_operations(&c), *peak);
+    c.batch = best_batch;
+#ifdef WITH_CBLAS
+    if (library == CBLAS && k->width >= 128) measure_hook(s, k, &c, peak);
+    else
+#endif
+        print_row(k->name, names[library], best_batch, best * best_batch, chain_operations(&c), *peak);
     for (int l = 0; l < k->layers; l++) {
         free(c.weights[l]);
     }
@@ -387,10 +444,9 @@ int main(int argc, char **argv)
         double peak = 0;
         if (s.only_case && strcmp(s.only_case, c->name) != 0) { continue; }
         if (s.quick && !s.only_case && i != 0 && i != 2) { continue; }
-        measure_dist(&s, c, 0, &peak);
+        measure_dist(&s, c, &peak);
         measure_chain(&s, c, KERNELS, &peak);
 #ifdef WITH_CBLAS
-        if (c->width >= 128) { measure_dist(&s, c, 1, &peak); }
         measure_chain(&s, c, CBLAS, &peak);
 #endif
 #ifdef WITH_DNNL

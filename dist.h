@@ -5595,7 +5595,8 @@ static size_t disti_wide_floats(const dist_context *ctx, const dist_net *net)
     return (size_t)(2 * net->max_rows + net->point_size) * DISTI_WIDE_COLUMNS;
 }
 
-/* Hidden layer l by the BLAS: y = activation(W x + W_point point + bias), rows of DISTI_WIDE_COLUMNS. */
+/* Hidden layer l by the BLAS: y = activation(W x + W_point point + bias), rows of DISTI_WIDE_COLUMNS. The product is
+   added to the bias, since a BLAS clears y in a pass of its own where it is not to add. */
 static void disti_wide_hidden(const dist_shape *shape, const disti_kernels *kernels, int l, int columns, const float *x,
                               const float *point, float *y)
 {
@@ -5604,20 +5605,18 @@ static void disti_wide_hidden(const dist_shape *shape, const disti_kernels *kern
     const dist_blas *blas = &shape->ctx->blas;
     const float *w = net->params + layer->weight, *bias = shape->bias + (size_t)l * (size_t)net->max_rows;
     const int ld = DISTI_WIDE_COLUMNS;
+    uint64_t mask[DISTI_WIDE];
+    for (size_t o = 0; o < (size_t)layer->out; o++)
+        for (size_t c = 0; c < (size_t)columns; c++) y[o * DISTI_WIDE_COLUMNS + c] = bias[o];
     blas->sgemm_fn(blas->user, 0, 0, layer->out, columns, layer->prev, layer->scale, w + layer->x_column, layer->in, x,
-                   ld, 0.0f, y, ld);
+                   ld, 1.0f, y, ld);
     if (layer->point > 0)
         blas->sgemm_fn(blas->user, 0, 0, layer->out, columns, layer->point, layer->scale, w + layer->point_column,
                        layer->in, point, ld, 1.0f, y, ld);
     for (size_t o = 0; o < (size_t)layer->out; o++) {
         float *row = y + o * DISTI_WIDE_COLUMNS;
-        for (const float *end = row + columns; row < end; row += DISTI_BLOCK) {
-            for (int c = 0; c < DISTI_BLOCK; c++) row[c] += bias[o];
-            for (int c = 0; net->activation == DIST_ACTIVATION_RELU && c < DISTI_BLOCK; c++)
-                row[c] = row[c] > 0.0f ? row[c] : 0.0f;
-            if (net->activation != DIST_ACTIVATION_RELU)
-                kernels->activate(net->activation, net->scale, DISTI_BLOCK, row, NULL);
-        }
+        if (net->activation == DIST_ACTIVATION_RELU) kernels->relu((size_t)(columns / DISTI_BLOCK), row, mask);
+        else kernels->activate(net->activation, net->scale, (size_t)columns, row, NULL);
     }
 }
 

@@ -275,6 +275,8 @@ static void dist_begin(dist_work *d, const net_case *c, int with_hook)
     context.workers = 1;
 #ifdef WITH_CBLAS
     if (with_hook) { context.blas.sgemm_fn = hook_sgemm; }
+#else
+    (void)with_hook;
 #endif
     d->w.ctx = dist_context_create(&context);
     desc.layers = c->layers;

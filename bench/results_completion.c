@@ -644,7 +644,7 @@ static void grid_run(const bench *b, grid *g, const char *name)
         for (int k = 0; k < g->sparsity_count; k++) {
             for (int m = 0; m < g->recipe_count; m++) {
                 const cell *c = grid_cell(g, i / g->shapes, i % g->shapes, k, m);
-                fprintf(f, "%s,%d,%s,%.0f,%s", family, index, g->sparsities[k].name, c->points, g->recipes[m].name);
+                fprintf(f, "%s,%d,%s,%.0f,\"%s\"", family, index, g->sparsities[k].name, c->points, g->recipes[m].name);
                 csv_number(f, c->chamfer);
                 fprintf(f, ",%.0f,%.3f\n", c->queries, c->seconds);
             }

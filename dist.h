@@ -619,6 +619,11 @@ DIST_API float dist_loss_normal(size_t n, const float *normal, const float *targ
 /* mean over all pixels of S_gt max(0, S) + (1 - S_gt) max(0, -S); S_gt = target[i] != 0              (paper, eq. 8) */
 DIST_API float dist_loss_silhouette(size_t n, const float *silhouette, const unsigned char *target, float weight,
                                     float *d_silhouette);
+/* The same as the paper's authors average it: the mean of S over the pixels with S_gt = 1 and S > 0, plus the mean of
+   -S over those with S_gt = 0 and S < 0. It does not fade as the wrong pixels become few. Better beside a mean over
+   depths */
+DIST_API float dist_loss_silhouette_wrong(size_t n, const float *silhouette, const unsigned char *target, float weight,
+                                          float *d_silhouette);
 /* mean |color - target| over hit pixels and channels */
 DIST_API float dist_loss_color(size_t n, const float *color, const float *target, const unsigned char *mask,
                                float weight, float *d_color);
@@ -11119,28 +11124,43 @@ DIST_API float dist_loss_normal(size_t n, const float *normal, const float *targ
     return (float)(scale * sum);
 }
 
-/* forward   L = weight / N sum_i S_gt max(0, S_i) + (1 - S_gt) max(0, -S_i)                            (paper, eq. 8)
-   backward  d_S_i += weight / N where S_gt and S_i > 0, -= where not S_gt and S_i < 0; 0 at the kink */
-DIST_API float dist_loss_silhouette(size_t n, const float *silhouette, const unsigned char *target, float weight,
-                                    float *d_silhouette)
+/* forward   L = weight sum_k 1 / N_k sum_{i: S_gt = k} max(0, S_i) for k = 1, max(0, -S_i) for k = 0     (paper, eq. 8)
+   backward  d_S_i += weight / N_1 where S_gt and S_i > 0, -= weight / N_0 where not S_gt and S_i < 0; 0 at the kink
+   N_k: all finite pixels, or those of its sum that are not 0. */
+static float disti_loss_silhouette(size_t n, const float *silhouette, const unsigned char *target, float weight,
+                                   int wrong_only, float *d_silhouette)
 {
-    double sum = 0.0;
-    size_t count = 0;
+    double sum[2] = {0.0, 0.0};
+    double count[2] = {0.0, 0.0};
+    double scale[2];
     if (!silhouette || !target) return 0.0f;
     for (size_t i = 0; i < n; i++) {
         if (!disti_finite(silhouette[i])) continue;
-        double wrong = target[i] ? (double)silhouette[i] : -(double)silhouette[i];
-        sum += wrong > 0.0 ? wrong : 0.0;
-        count++;
+        int in = target[i] != 0;
+        double wrong = in ? (double)silhouette[i] : -(double)silhouette[i];
+        if (wrong > 0.0) sum[in] += wrong;
+        if (wrong > 0.0 || !wrong_only) count[in] += 1.0;
     }
-    if (count == 0) return 0.0f;
-    double scale = (double)weight / (double)count;
+    if (!wrong_only) count[0] = count[1] = count[0] + count[1];
+    for (int k = 0; k < 2; k++) scale[k] = count[k] > 0.0 ? (double)weight / count[k] : 0.0;
     for (size_t i = 0; d_silhouette && i < n; i++) {
         if (!disti_finite(silhouette[i])) continue;
-        if (target[i] && silhouette[i] > 0.0f) d_silhouette[i] += (float)scale;
-        if (!target[i] && silhouette[i] < 0.0f) d_silhouette[i] -= (float)scale;
+        if (target[i] && silhouette[i] > 0.0f) d_silhouette[i] += (float)scale[1];
+        if (!target[i] && silhouette[i] < 0.0f) d_silhouette[i] -= (float)scale[0];
     }
-    return (float)(scale * sum);
+    return (float)(scale[0] * sum[0] + scale[1] * sum[1]);
+}
+
+DIST_API float dist_loss_silhouette(size_t n, const float *silhouette, const unsigned char *target, float weight,
+                                    float *d_silhouette)
+{
+    return disti_loss_silhouette(n, silhouette, target, weight, 0, d_silhouette);
+}
+
+DIST_API float dist_loss_silhouette_wrong(size_t n, const float *silhouette, const unsigned char *target, float weight,
+                                          float *d_silhouette)
+{
+    return disti_loss_silhouette(n, silhouette, target, weight, 1, d_silhouette);
 }
 
 static int disti_loss_color_counts(const float *color, const float *target, const unsigned char *mask, size_t i)

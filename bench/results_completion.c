@@ -258,7 +258,7 @@ static void problem_keep(problem *p, const sparsity *how_much)
 
 /* ---- the fits ---------------------------------------------------------------------------------------------------- */
 
-/* What the silhouette's loss is a mean over. */
+/* What the silhouette's loss is a mean over: dist_loss_silhouette's all pixels, or dist_loss_silhouette_wrong's. */
 enum { SILHOUETTE_NONE, SILHOUETTE_ALL, SILHOUETTE_WRONG };
 
 /* samples: DeepSDF's way; else through the renderer. */
@@ -345,28 +345,6 @@ static void picture_loss_destroy(picture_loss *l)
     free(l->pixels);
 }
 
-/* The paper's equation 8 as its authors' code has it: the mean over the pixels that should hit and miss, plus the mean
-   over those that hit and should not. However few they are they count as much as all of the depth does; a mean over
-   all pixels (dist_loss_silhouette) fades as they become fewer. */
-static double loss_of_wrong_pixels(size_t n, const float *silhouette, const unsigned char *target, float weight,
-                                   float *d_silhouette)
-{
-    double sum[2] = {0, 0}, count[2] = {0, 0};
-    for (size_t i = 0; i < n; i++) {
-        int in = target[i] != 0;
-        if (in ? silhouette[i] > 0.0f : silhouette[i] < 0.0f) {
-            sum[in] += fabs((double)silhouette[i]);
-            count[in] += 1;
-        }
-    }
-    for (size_t i = 0; i < n; i++) {
-        int in = target[i] != 0;
-        if (in && silhouette[i] > 0.0f) { d_silhouette[i] += weight / (float)count[1]; }
-        if (!in && silhouette[i] < 0.0f) { d_silhouette[i] -= weight / (float)count[0]; }
-    }
-    return (double)weight * ((count[0] > 0 ? sum[0] / count[0] : 0) + (count[1] > 0 ? sum[1] / count[1] : 0));
-}
-
 static double picture_loss_step(worker *w, const problem *p, const recipe *r, picture_loss *l, dist_stats *stats,
                                 float *d_code)
 {
@@ -382,7 +360,8 @@ static double picture_loss_step(worker *w, const problem *p, const recipe *r, pi
     if (r->silhouette) {
         memset(l->d_out.silhouette, 0, n * sizeof(float));
         loss += r->silhouette == SILHOUETTE_WRONG
-                    ? loss_of_wrong_pixels(n, l->out.silhouette, p->seen.mask, r->weights[1], l->d_out.silhouette)
+                    ? (double)dist_loss_silhouette_wrong(n, l->out.silhouette, p->seen.mask, r->weights[1],
+                                                         l->d_out.silhouette)
                     : (double)dist_loss_silhouette(n, l->out.silhouette, p->seen.mask, r->weights[1],
                                                    l->d_out.silhouette);
     }
@@ -644,7 +623,8 @@ static void grid_run(const bench *b, grid *g, const char *name)
         for (int k = 0; k < g->sparsity_count; k++) {
             for (int m = 0; m < g->recipe_count; m++) {
                 const cell *c = grid_cell(g, i / g->shapes, i % g->shapes, k, m);
-                fprintf(f, "%s,%d,%s,%.0f,\"%s\"", family, index, g->sparsities[k].name, c->points, g->recipes[m].name);
+                fprintf(f, "%s,%d,%s,%.0f,\"%s\"", family, index, g->sparsities[k].name, c->points,
+                        g->recipes[m].name);
                 csv_number(f, c->chamfer);
                 fprintf(f, ",%.0f,%.3f\n", c->queries, c->seconds);
             }
@@ -729,9 +709,9 @@ static void completion_markdown(const bench *b, const grid *g)
     FILE *f = results_section(r, "completion", "Shape completion from one depth picture", "build/results_completion");
     fprintf(f,
             "Median Chamfer distance x 1000 (as DeepSDF defines it, 30,000 points) over %d held-out shapes of each "
-            "family,\n%d x %d pixels from any side, %d steps of Adam at 0.01 from the family's mean code, weights of depth,"
-            " silhouette and\nprior 10, 1, 1. *DeepSDF* is its own fitting, as the paper's authors compare with it:"
-            " samples up to 0.01 off the surface\nalong the true normals, which it is given, and in the free space"
+            "family,\n%d x %d pixels from any side, %d steps of Adam at 0.01 from the family's mean code, weights of "
+            "depth, silhouette and\nprior 10, 1, 1. *DeepSDF* is its own fitting, as the paper's authors compare with it"
+            ": samples up to 0.01 off the surface\nalong the true normals, which it is given, and in the free space"
             " before it. *Ours* is depth alone; it has no normals. In\n*(paper)*: the paper's median, of other"
             " shapes (200 of ShapeNet each) by other decoders: not the same quantity, to be\ncompared by the order of"
             " the rows only. Bold: the best of the three.\n\n",
@@ -1070,8 +1050,8 @@ static void curves(const bench *b)
                               "build/results_completion");
     fprintf(f,
             "The paper's rows, each with all before it, and our tracer; all with the paper's gradient (K = 1), dense"
-            " depth and\nsilhouette, %d held-out shapes, %d x %d pixels. Loss: depth and silhouette, weighted; geometric"
-            " means.\n\n"
+            " depth and\nsilhouette, %d held-out shapes, %d x %d pixels. Loss: depth and silhouette, weighted; "
+            "geometric means.\n\n"
             "| | loss at the start | after %d steps | after %d | Chamfer x 1000 at the end | queries, millions | "
             "processor seconds |\n|---|---|---|---|---|---|---|\n",
             v.problems, v.size, v.size, b->s.iterations / 4, b->s.iterations - 1);
@@ -1152,9 +1132,9 @@ static void gradients(const bench *b)
                               "build/results_completion");
     fprintf(f,
             "%d held-out shapes, dense depth and silhouette, %d x %d pixels, our tracer without warm start. For each "
-            "Chamfer distance x 1000:"
-            " fits that reach\nit within %d steps; of all fits the median step, queries and processor seconds at"
-            " which they do (none: more than half do not).\n\n| |",
+            "Chamfer distance\nx 1000: fits that reach it within %d steps; of all fits the median step, queries and "
+            "processor seconds at which they do\n(none: half of them or more do not). At the end: geometric mean.\n\n"
+            "| |",
             v.problems, v.size, v.size, b->s.iterations);
     for (int g = 0; g < 3; g++) {
         fprintf(f, " %.1f: reached | steps | queries, millions | seconds |", goals[g]);

@@ -97,7 +97,8 @@ static double fit_loss(fit *f, double terms[3])
     terms[0] = (double)dist_loss_depth(s->n, f->out.depth, s->seen, f->out.mask, weights[0], f->d_out.depth);
     terms[1] = 0;
     if (f->out.silhouette) {
-        terms[1] = (double)dist_loss_silhouette(s->n, f->out.silhouette, s->mask, weights[1], f->d_out.silhouette);
+        terms[1] =
+            (double)dist_loss_silhouette_wrong(s->n, f->out.silhouette, s->mask, weights[1], f->d_out.silhouette);
     }
     terms[2] = (double)dist_loss_code(f->code_size, f->code, weights[2] / (float)f->code_size, f->d_code);
     return terms[0] + terms[1] + terms[2];

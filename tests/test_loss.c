@@ -2,8 +2,8 @@
    Losses and Adam: values and gradients against the formulas in double, and what must not count. */
 #include "test.h"
 
-enum { N = 200, KINDS = 5 };
-enum { DEPTH, NORMAL, SILHOUETTE, COLOR, CODE };
+enum { N = 200, KINDS = 6 };
+enum { DEPTH, NORMAL, SILHOUETTE, WRONG, COLOR, CODE };
 
 typedef struct loss_case {
     float x[3 * N], target[3 * N], d_x[3 * N];
@@ -21,6 +21,7 @@ static float loss_call(int kind, const loss_case *c, float weight, float *d_x)
     case DEPTH: return dist_loss_depth(N, c->x, c->target, c->mask, weight, d_x);
     case NORMAL: return dist_loss_normal(N, c->x, c->target, c->mask, weight, d_x);
     case SILHOUETTE: return dist_loss_silhouette(N, c->x, c->shape, weight, d_x);
+    case WRONG: return dist_loss_silhouette_wrong(N, c->x, c->shape, weight, d_x);
     case COLOR: return dist_loss_color(N, c->x, c->target, c->mask, weight, d_x);
     default: return dist_loss_code(N, c->x, weight, d_x);
     }
@@ -29,13 +30,16 @@ static float loss_call(int kind, const loss_case *c, float weight, float *d_x)
 /* The same in double, by other means: x comes as doubles, so that it can be moved by less than a float shows. */
 static double loss_reference(int kind, const loss_case *c, const double *x)
 {
-    double sum = 0, count = 0;
+    double sum = 0, count = 0, miss[2] = {0, 0}, over[2] = {0, 0};
     for (size_t i = 0; i < N; i++) {
         const float *t = c->target + 3 * i;
         double length = sqrt((double)t[0] * (double)t[0] + (double)t[1] * (double)t[1] + (double)t[2] * (double)t[2]);
         if (kind == SILHOUETTE) {
             sum += c->shape[i] ? fmax(0, x[i]) : fmax(0, -x[i]);
             count += 1;
+        } else if (kind == WRONG) {
+            double *set = c->shape[i] ? miss : over, value = c->shape[i] ? x[i] : -x[i];
+            if (value > 0) set[0] += value, set[1] += 1;
         } else if (kind == CODE) {
             sum += x[i] * x[i];
             count = 1;
@@ -50,7 +54,7 @@ static double loss_reference(int kind, const loss_case *c, const double *x)
             count += 3;
         }
     }
-    return sum / count;
+    return kind == WRONG ? miss[0] / miss[1] + over[0] / over[1] : sum / count;
 }
 
 static void loss_fill(loss_case *c, int kind, uint64_t seed)
@@ -87,7 +91,7 @@ TEST(loss_gradients_are_central_differences)
         for (size_t i = 0; i < size; i++) x[i] = (double)c.x[i];
         loss_call(kind, &c, 2.5f, c.d_x);
         for (size_t i = 0; i < size; i++) {
-            double kink = kind == SILHOUETTE ? x[i] : x[i] - (double)c.target[i];
+            double kink = kind == SILHOUETTE || kind == WRONG ? x[i] : x[i] - (double)c.target[i];
             if (kind != CODE && kind != NORMAL && fabs(kink) < 10 * h) {
                 excluded++;
                 continue;
@@ -149,7 +153,7 @@ TEST(losses_over_nothing_are_zero_without_gradient)
         loss_case c;
         loss_fill(&c, kind, 31);
         for (size_t i = 0; i < 3 * N; i++) c.target[i] = loss_bits(0x7fc00000u);
-        if (kind == SILHOUETTE || kind == CODE)
+        if (kind == SILHOUETTE || kind == WRONG || kind == CODE)
             for (size_t i = 0; i < 3 * N; i++) c.x[i] = loss_bits(0x7fc00000u);
         CHECK_NEAR(0, loss_call(kind, &c, 1.0f, c.d_x), 0);
         for (size_t i = 0; i < 3 * N; i++) CHECK_NEAR(0, c.d_x[i], 0);
@@ -157,8 +161,22 @@ TEST(losses_over_nothing_are_zero_without_gradient)
     CHECK_NEAR(0, dist_loss_depth(0, NULL, NULL, NULL, 1.0f, NULL), 0);
     CHECK_NEAR(0, dist_loss_normal(5, NULL, NULL, NULL, 1.0f, NULL), 0);
     CHECK_NEAR(0, dist_loss_silhouette(5, NULL, NULL, 1.0f, NULL), 0);
+    CHECK_NEAR(0, dist_loss_silhouette_wrong(5, NULL, NULL, 1.0f, NULL), 0);
     CHECK_NEAR(0, dist_loss_color(5, NULL, NULL, NULL, 1.0f, NULL), 0);
     CHECK_NEAR(0, dist_loss_code(5, NULL, 1.0f, NULL), 0);
+}
+
+/* However few pixels are wrong, they weigh the same; a set without any adds nothing. */
+TEST(the_silhouette_of_wrong_pixels_does_not_fade)
+{
+    float silhouette[8] = {0.5f, -1, -1, -1, 2, 2, 2, 2}, d[8] = {0, 0, 0, 0, 0, 0, 0, 0};
+    unsigned char target[8] = {1, 1, 1, 1, 0, 0, 0, 0};
+    CHECK_NEAR(1.5, dist_loss_silhouette_wrong(8, silhouette, target, 3.0f, d), 0);
+    CHECK_NEAR(3, d[0], 0);
+    for (size_t i = 1; i < 8; i++) CHECK_NEAR(0, d[i], 0);
+    silhouette[6] = -0.25f;
+    CHECK_NEAR(2.25, dist_loss_silhouette_wrong(8, silhouette, target, 3.0f, d), 0);
+    CHECK_NEAR(-3, d[6], 0);
 }
 
 TEST(target_normals_are_normalized_and_zero_ones_left_out)
@@ -266,6 +284,7 @@ int main(int argc, char **argv)
     RUN(loss_gradients_are_added);
     RUN(depth_targets_that_are_not_seen_do_not_count);
     RUN(losses_over_nothing_are_zero_without_gradient);
+    RUN(the_silhouette_of_wrong_pixels_does_not_fade);
     RUN(target_normals_are_normalized_and_zero_ones_left_out);
     RUN(a_million_small_terms_are_summed_without_loss);
     RUN(adam_is_its_formula_for_a_hundred_steps);

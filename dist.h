@@ -10309,8 +10309,8 @@ static void disti_warm_seed(const disti_tile *tile, const disti_bench *bench)
 }
 
 /* What disti_warm_beside asks: for each hit the s of the nearest hit among its eight neighbors, if that is more than
-   three pixels nearer and the neighbor across is not as much farther; for each miss likewise, else that of the hit
-   beside it, if that is more than three pixels away from its own place; 3e38: none. */
+   three pixels nearer and the neighbor across is not as much farther; for each miss that of the hit farthest from its
+   own place, if that is more than three pixels; 3e38: none. */
 static void disti_nearest_task(void *arg, int index, int worker)
 {
     const disti_render_job *job = (const disti_render_job *)arg;
@@ -10324,7 +10324,7 @@ static void disti_nearest_task(void *arg, int index, int worker)
             float s = tape->s[pixel], nearest = 3e38f;
             int hit = tape->status[pixel] & DISTI_TAPE_HIT,
                 none = tape->status[pixel] != ((int)DIST_RAY_MISS | DISTI_TAPE_SAMPLE);
-            float closest = 3e38f, front = 3e38f;
+            float most = job->step;
             for (int k = 0; k < 8 && (hit || !none); k++) {
                 int side = k & 1 ? -1 : 1, ox = dx[k / 2] * side, oy = dy[k / 2] * side;
                 if (x + ox < 0 || x + ox >= tape->width || y + oy < 0 || y + oy >= tape->height) continue;
@@ -10333,9 +10333,8 @@ static void disti_nearest_task(void *arg, int index, int worker)
                 if (!(tape->status[other] & DISTI_TAPE_HIT)) continue;
                 if (!hit) {
                     float off = ahead < 0.0f ? -ahead : ahead;
-                    if (ahead > job->step) front = DISTI_MIN(front, tape->s[other]);
-                    if (off < closest) nearest = off > job->step ? tape->s[other] : 3e38f;
-                    closest = DISTI_MIN(closest, off);
+                    if (off > most) nearest = tape->s[other];
+                    most = DISTI_MAX(most, off);
                     continue;
                 }
                 if (ahead < job->step) continue;
@@ -10345,7 +10344,7 @@ static void disti_nearest_task(void *arg, int index, int worker)
                     tape->s[across] - s > 0.3f * ahead;
                 if (!steep) nearest = DISTI_MIN(nearest, tape->s[other]);
             }
-            tape->nearest[pixel] = front < 2e38f ? front : nearest;
+            tape->nearest[pixel] = nearest;
         }
     }
 }

@@ -570,7 +570,8 @@ typedef struct dist_images {
     float *color;          /* (h, w, 3) */
     unsigned char *mask;   /* 1 hit, 0 not: the authority */
     unsigned char *status; /* DIST_RAY_* */
-    float *error;          /* bound on the error of distance; 0 where that is the background */
+    float *error;          /* bound on the error of distance; 0 where that is the background. Behind the edge of a
+                              nearer surface it reaches to that */
     dist_stats *stats;
 } dist_images;
 
@@ -7451,6 +7452,7 @@ enum {
     DISTI_JUMP,    /* to where f should end */
     DISTI_BACK,    /* back from a start inside */
     DISTI_BAND,    /* 0 < f < epsilon */
+    DISTI_LEAST,   /* where f is least in the band */
     DISTI_BRACKET, /* between two signs */
     DISTI_PREDICT  /* where the neighbors say */
 };
@@ -7648,7 +7650,10 @@ static int disti_ray_end(disti_ray *ray, int status, float s, float f, float err
 static int disti_ray_give_up(disti_ray *ray)
 {
     int mode = ray->mode, begun = mode >= DISTI_MARCH && mode <= DISTI_BRACKET && mode != DISTI_BACK;
-    float front = mode == DISTI_BRACKET ? ray->a : mode == DISTI_BACK ? ray->enter : begun ? ray->s : ray->start;
+    float front = mode == DISTI_BRACKET || mode == DISTI_LEAST ? ray->a
+                  : mode == DISTI_BACK                         ? ray->enter
+                  : begun                                      ? ray->s
+                                                               : ray->start;
     float end = mode == DISTI_BRACKET || (begun && ray->fb < 0.0f && ray->b > ray->s) ? ray->b : ray->leave;
     float s = ray->fbest < 2e38f ? ray->best : ray->q;
     return disti_ray_end(ray, DIST_RAY_UNRESOLVED, s, ray->fbest * ray->sign, DISTI_MAX(s - front, end - s));
@@ -7798,10 +7803,71 @@ static int disti_ray_feel(const disti_tracer *tracer, disti_ray *ray, float epsi
     return disti_ray_ask(ray, DISTI_BAND, DISTI_MIN(q, ray->leave));
 }
 
-/* f < epsilon at the front without a crossing yet: it is a hit by the paper's rule, but a crossing close by is a
-   better one. Leaving the band again (by 4 epsilon) was a touch: a hit at its least f, unless the ray began there
-   (no hit with the surface it starts from). f that does not change at all is a plateau. The band's first sample
-   stands in a, fa, its least in b, fb. */
+/* Past the least f of the band, which lies between a and b, at s as far as is known; f is not negative at all three.
+   Where it is convex it stays above its chords continued: as soon as these stay above 0, the ray only came near. Until
+   then, or until f < 0, it is looked for in turn where two equal slopes meet, where a parabola is least, and by golden
+   sections. A steep least f below half of epsilon may be a sheet that is thinner than floats can tell: a hit. */
+static int disti_ray_least(const disti_tracer *tracer, disti_ray *ray)
+{
+    float before = ray->s - ray->a, after = ray->b - ray->s;
+    float left = (ray->fa - ray->f) / before, right = (ray->fb - ray->f) / after;
+    float drop = DISTI_MAX(right * before, left * after);
+    int spent = ray->moved > 12 || ray->b - ray->a < 4e-6f * tracer->field->radius;
+    float epsilon = disti_ray_epsilon(tracer, ray, ray->s);
+    int narrow = DISTI_MIN(left, right) > 0.3f * tracer->lipschitz || ray->b - ray->a < epsilon;
+    int sheet = narrow && ray->f < 0.5f * epsilon; /* too thin to be sure of */
+    if (spent || drop < ray->f) {
+        if (sheet || ray->f <= tracer->noise)
+            return disti_ray_end(ray, DIST_RAY_HIT, ray->s, ray->f, ray->f / tracer->lipschitz + ray->b - ray->a);
+    }
+    if (spent || drop < ray->f) {
+        float s = ray->s, f = ray->f;
+        ray->s = ray->b;
+        ray->f = ray->fb;
+        ray->b = s;
+        ray->fb = f;
+        ray->a = ray->s;
+        ray->fa = ray->f;
+        ray->slope = right;
+        ray->moved = ray->known = 1;
+        if (ray->s >= ray->leave) return disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest * ray->sign, 0.0f);
+        if (ray->f < 4.0f * epsilon) return disti_ray_feel(tracer, ray, epsilon);
+        ray->fb = 0.0f; /* the band is over */
+        return disti_ray_step(tracer, ray);
+    }
+    float least = 2.4e-7f * tracer->field->radius, steeper = DISTI_MAX(left, right), shift = 0.0f;
+    if (ray->moved % 3 == 1 && steeper > 0.0f) shift = 0.5f * ((ray->fa - ray->fb) / steeper + after - before);
+    else if (ray->moved % 3 == 2 && steeper > 0.0f) shift = 0.5f * (left * after - right * before) / (left + right);
+    if ((shift < 0.0f ? -shift : shift) < least) shift = after > before ? 0.38f * after : -0.38f * before;
+    ray->moved++;
+    return disti_ray_ask(ray, DISTI_LEAST, ray->s + shift);
+}
+
+static int disti_ray_leasted(const disti_tracer *tracer, disti_ray *ray, float f)
+{
+    float q = ray->q;
+    if (f <= 0.0f) {
+        if (q < ray->s) return disti_ray_open_bracket(tracer, ray, ray->a, ray->fa, q, f);
+        return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, q, f);
+    }
+    int lower = f < ray->f, beyond = q > ray->s;
+    if (lower != beyond) { /* the new end is b */
+        ray->b = lower ? ray->s : q;
+        ray->fb = lower ? ray->f : f;
+    } else {
+        ray->a = lower ? ray->s : q;
+        ray->fa = lower ? ray->f : f;
+    }
+    if (lower) {
+        ray->s = q;
+        ray->f = f;
+    }
+    return disti_ray_least(tracer, ray);
+}
+
+/* 0 < f < epsilon at the front: the surface is near, if not hit. Leaving the band again (by 4 epsilon) without a
+   crossing was no hit, nor is it the surface that the ray began at. f that does not change at all is a plateau. The
+   band's first sample stands in a, fa, the last but one in b, fb. */
 static int disti_ray_band(const disti_tracer *tracer, disti_ray *ray, float f)
 {
     float epsilon = disti_ray_epsilon(tracer, ray, ray->s);
@@ -7810,30 +7876,31 @@ static int disti_ray_band(const disti_tracer *tracer, disti_ray *ray, float f)
     if (f < 0.0f)
         return disti_ray_end(ray, DIST_RAY_HIT, ray->s, 0.0f, 0.0f); /* the start is the surface, to the last bit */
     ray->side++;
-    if (f < ray->fb) {
+    if (f < 0.5f * ray->fa) ray->moved = 1; /* toward another surface than the one that it began at */
+    float fall = ray->b < ray->s ? (ray->fb - ray->f) / (ray->s - ray->b) * (ray->q - ray->s) : 0.0f; /* as before */
+    if (ray->moved && fall > 0.0f && (f >= ray->f || (f > 0.8f * ray->f && fall > ray->f))) {
+        ray->a = ray->b;
+        ray->fa = ray->fb;
         ray->b = ray->q;
         ray->fb = f;
-        if (f < 0.5f * ray->fa) ray->moved = 1; /* toward another surface than the one that it began at */
+        return disti_ray_least(tracer, ray);
     }
-    if (f >= 4.0f * epsilon || ray->q >= ray->leave) {
-        if (ray->moved)
-            return disti_ray_end(ray, DIST_RAY_HIT, ray->b, ray->fb, ray->fb / tracer->lipschitz + (ray->q - ray->a));
-        ray->s = ray->q;
-        ray->f = f;
-        ray->slope = slope;
-        ray->known = 1;
-        ray->fb = 0.0f; /* the band is over */
-        return ray->q >= ray->leave ? disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest * ray->sign, 0.0f)
-                                    : disti_ray_step(tracer, ray);
-    }
-    if (ray->side >= 16) {
-        float change = ray->fa - f;
-        if (change < 1e-3f * (ray->q - ray->a)) return disti_ray_end(ray, DIST_RAY_PLATEAU, ray->b, ray->fb, 0.0f);
-        return disti_ray_end(ray, DIST_RAY_HIT, ray->b, ray->fb, ray->fb * (ray->q - ray->a) / change);
-    }
+    if (ray->q >= ray->leave) return disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest * ray->sign, 0.0f);
+    float change = ray->fa - f, all = ray->q - ray->a;
+    ray->b = ray->s;
+    ray->fb = ray->f;
     ray->s = ray->q;
     ray->f = f;
     ray->slope = slope;
+    if (f >= 4.0f * epsilon) {
+        ray->known = 1;
+        ray->fb = 0.0f; /* the band is over */
+        return disti_ray_step(tracer, ray);
+    }
+    if (ray->side >= 16) {
+        if (change < 1e-3f * all) return disti_ray_end(ray, DIST_RAY_PLATEAU, ray->s, f, 0.0f);
+        return disti_ray_end(ray, DIST_RAY_HIT, ray->s, f, f * all / change);
+    }
     return disti_ray_feel(tracer, ray, epsilon);
 }
 
@@ -7847,7 +7914,7 @@ static int disti_ray_inside(const disti_tracer *tracer, disti_ray *ray, float f)
     ray->f = -f;
     ray->best = ray->enter;
     ray->fbest = f;
-    ray->slope = ray->fb = 0.0f; /* what was found beyond was so with the other sign */
+    ray->slope = ray->fa = ray->fb = 0.0f; /* what was found beyond was so with the other sign */
     ray->known = 0;
     return disti_ray_step(tracer, ray);
 }
@@ -7884,13 +7951,16 @@ static int disti_ray_predicted(const disti_tracer *tracer, disti_ray *ray, float
         float off = ray->q + step - ray->target;
         ray->slope = slope;
         ray->off = DISTI_MAX(off < 0.0f ? -off : off, 1e-9f);
-        return disti_ray_end(ray, DIST_RAY_HIT, ray->q + step, f, 2.0f * length - tracer->noise / slope);
+        /* short of the surface nothing tells whether f flattens on the way, most likely where it is flat already */
+        float factor = f > 0.0f && slope > -0.6f * tracer->lipschitz ? 10.0f : 2.0f;
+        return disti_ray_end(ray, DIST_RAY_HIT, ray->q + step, f, factor * length - tracer->noise / slope);
     }
     if (!good || ray->q + step <= (fronted ? ray->s : ray->start) || ray->q + step >= ray->leave) {
         if (f < 0.0f && !(ray->fb < 0.0f)) {
             ray->b = ray->q;
             ray->fb = f;
         }
+        ray->fa = 0.0f;
         ray->side = 0;
         return fronted ? disti_ray_step(tracer, ray) : disti_ray_ask(ray, DISTI_FIRST, ray->start);
     }
@@ -7932,7 +8002,7 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
         }
         ray->s = q;
         ray->f = f;
-        ray->slope = 0.0f;
+        ray->slope = ray->fa = 0.0f;
         ray->known = 0;
         break;
     case DISTI_BACK:
@@ -7943,6 +8013,7 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
         ray->width *= 1.6f;
         return disti_ray_ask(ray, DISTI_BACK, DISTI_MAX(q - ray->width, ray->enter));
     case DISTI_BAND: return disti_ray_band(tracer, ray, f);
+    case DISTI_LEAST: return disti_ray_leasted(tracer, ray, f);
     case DISTI_PREDICT: return disti_ray_predicted(tracer, ray, f);
     case DISTI_SKIP:
     case DISTI_MARCH:
@@ -7975,6 +8046,8 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
             if (left <= (tracer->how.certified ? spacing : 1e-3f * tracer->field->radius))
                 return disti_ray_open_bracket(tracer, ray, q, f, ray->b, ray->fb);
         }
+        ray->a = ray->s;
+        ray->fa = ray->mode == DISTI_SKIP ? 0.0f : ray->f;
         float clamp = tracer->field->clamp > 0.0f ? 0.98f * tracer->field->clamp : 3e38f;
         int clamped = f > clamp || ray->f > clamp; /* then no slope is known, and none foretells a surface */
         ray->slope = clamped ? DISTI_MAX((f - ray->f) / step, 0.0f) : (f - ray->f) / step;
@@ -7987,6 +8060,7 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
             ray->slope = clamped ? DISTI_MAX((ray->fb - f) / (ray->b - q), 0.0f) : (ray->fb - f) / (ray->b - q);
             ray->s = ray->b;
             ray->f = ray->fb;
+            ray->fa = 0.0f;
         }
         if (ray->b <= q) ray->fb = 0.0f;
         break;
@@ -7995,11 +8069,18 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
     if (ray->f < disti_ray_epsilon(tracer, ray, ray->s)) {
         if (ray->fb < 0.0f && ray->b > ray->s)
             return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->b, ray->fb);
-        ray->a = ray->b = ray->s;
-        ray->fa = ray->fb = ray->f;
+        float epsilon = disti_ray_epsilon(tracer, ray, ray->s);
         ray->side = 0;
-        ray->moved = ray->slope < 0.0f; /* came down to here from farther out */
-        return disti_ray_feel(tracer, ray, disti_ray_epsilon(tracer, ray, ray->s));
+        ray->moved = ray->slope < 0.0f; /* came down to here from farther out: from a, or where f was epsilon */
+        ray->b = ray->fa > 0.0f ? ray->a : ray->s;
+        ray->fb = ray->fa > 0.0f ? ray->fa : ray->f;
+        if (ray->moved && !(ray->fa > 0.0f)) {
+            ray->b += (epsilon - ray->f) / ray->slope;
+            ray->fb = epsilon;
+        }
+        ray->a = ray->s;
+        ray->fa = ray->f;
+        return disti_ray_feel(tracer, ray, epsilon);
     }
     if (ray->s >= ray->leave) return disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest * ray->sign, 0.0f);
     return disti_ray_aims(tracer, ray, ray->f) ? disti_ray_aim(ray) : disti_ray_step(tracer, ray);
@@ -8851,6 +8932,7 @@ typedef struct disti_guess {
     float depth, slope;
     int quality; /* 3: by four hits alike, 2: good, 1: but the slope is anyone's guess, -1: beyond an edge, 0: none */
     float off;   /* how far the prediction was from the neighbors; 0: unknown */
+    float sag;   /* how far the cubic is from the line */
 } disti_guess;
 
 /* Prediction along one axis of the picture from the hits at -3 h, -h, h, 3 h. Across an edge, where the hits at -h and
@@ -8881,7 +8963,9 @@ static disti_guess disti_predict_axis(const disti_tracer *tracer, const disti_ra
         guess.slope = z1 > z2 ? slope1 : slope2;
         guess.quality = -1;
     } else if (near_a && near_b) {
+        float line = 1.0f / inverse;
         inverse = (9.0f / z1 + 9.0f / z2 - 1.0f / a - 1.0f / b) * 0.0625f;
+        guess.sag = line * inverse < 1.0f ? 1.0f / inverse - line : line - 1.0f / inverse;
         float off1 = ray[-h * stride].off, off2 = ray[h * stride].off;
         if (off1 > 0.0f && off2 > 0.0f) guess.off = DISTI_MAX(off1, off2);
         guess.quality += guess.quality == 2;
@@ -8906,6 +8990,7 @@ static int disti_predict(const disti_tracer *tracer, const disti_tile *tile, con
             guess.depth = 0.5f * (guess.depth + other.depth);
             guess.slope = 0.5f * (guess.slope + other.slope);
             guess.off = guess.off > 0.0f && other.off > 0.0f ? DISTI_MAX(guess.off, other.off) : 0.0f;
+            guess.sag = DISTI_MAX(guess.sag, other.sag);
             guess.quality = DISTI_MIN(guess.quality, other.quality);
         } else {
             if (guess.quality <= 0 && other.quality > 0) guess = other;
@@ -8926,7 +9011,9 @@ static int disti_predict(const disti_tracer *tracer, const disti_tile *tile, con
         if (h == 1 && guess.quality == 3 && guess.off > 0.0f && guess.off <= epsilon) {
             ray->slope = guess.slope;
             ray->off = guess.off;
-            return disti_ray_end(ray, DIST_RAY_HIT, s, 0.0f, 2.0f * (guess.off + epsilon));
+            /* at a crease amid the four, where the cubic is off by up to three times what it differs from the line */
+            float error = guess.off + epsilon + 2.0f * guess.sag / ray->cosine;
+            return disti_ray_end(ray, DIST_RAY_HIT, s, 0.0f, 2.0f * error);
         }
         disti_ray_aim(ray);
     }
@@ -8980,6 +9067,38 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
         }
     }
     bench->balls = NULL;
+}
+
+/* What the neighbors say about the error bounds of hits, in the end. Behind a nearer neighbor, across a step in depth,
+   the nearer surface may go on in front of the hit, as the Lipschitz figure is an estimate: the bound reaches to there.
+   A predicted hit may be off by what it differs from the cubic through its neighbors, (-1, 4, 4, -1) / 6, or from their
+   mean if that is less: where the surface is smooth, next to nothing. */
+static void disti_trace_doubt(const disti_tile *tile, const disti_bench *bench)
+{
+    for (int i = 0; i < tile->width * tile->height; i++) {
+        disti_ray *ray = &bench->rays[i];
+        float z = disti_hit_depth(ray, 0, 1, 0, 0), doubt = 0.0f;
+        if (!(z > 0.0f)) continue;
+        for (int axis = 0; axis < 2; axis++) {
+            int at = axis ? i / tile->width : i % tile->width, end = axis ? tile->height : tile->width;
+            int stride = axis ? tile->width : 1;
+            float z1 = disti_hit_depth(ray, at, end, -1, stride), z2 = disti_hit_depth(ray, at, end, 1, stride);
+            if (!(z1 > 0.0f && z2 > 0.0f)) continue;
+            float fall1 = z - z1, fall2 = z - z2, pixel = 2.0f * ray->footprint * z;
+            float size1 = fall1 < 0.0f ? -fall1 : fall1, size2 = fall2 < 0.0f ? -fall2 : fall2;
+            if (DISTI_MAX(size1, size2) > 2.0f * DISTI_MIN(size1, size2) + pixel) {
+                doubt = DISTI_MAX(doubt, size1 > size2 ? fall1 : fall2);
+                continue;
+            }
+            float a = disti_hit_depth(ray, at, end, -2, stride), b = disti_hit_depth(ray, at, end, 2, stride);
+            float off = 0.5f * (fall1 + fall2), cubic = off;
+            if (!(ray->off > 0.0f)) continue;
+            if (a > 0.0f && b > 0.0f) cubic = (4.0f * (fall1 + fall2) + a + b - z - z) / 6.0f;
+            off = DISTI_MIN(off < 0.0f ? -off : off, cubic < 0.0f ? -cubic : cubic);
+            doubt = DISTI_MAX(doubt, off);
+        }
+        ray->error = DISTI_MAX(ray->error, doubt / ray->cosine);
+    }
 }
 
 /* Soft silhouette of the rays that miss: min |f| along each. Cones, balls and stretched steps leave no sample near the
@@ -10399,6 +10518,8 @@ static void disti_render_task(void *arg, int index, int worker)
         for (int i = 0; i < n && job->tape; i++) bench.rays[i].stop = bench.rays[i].start;
         if (job->warm) disti_render_warm(job, worker, &tile, &bench);
         if (job->predict) disti_trace_lattice(tracer, worker, &tile, &bench);
+        if (job->predict && !tracer->how.certified && (job->out->error || job->out->stats))
+            disti_trace_doubt(&tile, &bench);
         else disti_trace_all(tracer, worker, &bench, (size_t)n);
         budget.marching = 0;
         disti_tile_trim(job, &tile, &bench);

@@ -10518,9 +10518,9 @@ static void disti_render_task(void *arg, int index, int worker)
         for (int i = 0; i < n && job->tape; i++) bench.rays[i].stop = bench.rays[i].start;
         if (job->warm) disti_render_warm(job, worker, &tile, &bench);
         if (job->predict) disti_trace_lattice(tracer, worker, &tile, &bench);
+        else disti_trace_all(tracer, worker, &bench, (size_t)n);
         if (job->predict && !tracer->how.certified && (job->out->error || job->out->stats))
             disti_trace_doubt(&tile, &bench);
-        else disti_trace_all(tracer, worker, &bench, (size_t)n);
         budget.marching = 0;
         disti_tile_trim(job, &tile, &bench);
         disti_trace_end(tracer, &bench, (size_t)(tile.width * tile.height));

@@ -4,7 +4,7 @@
    Include it after dist.h. Errors end the program with one sentence on stderr and exit status 2.
 
    Contents: failing and clock, options, progress, random numbers, files and JSON, model, code and camera, pictures,
-   curves.
+   error and cost, curves.
    COMMON_NO_MODEL, defined before the include, leaves out the embedded model (for the program that makes it);
    COMMON_TEXTURE adds the texture that colors it. */
 #ifndef DIST_EXAMPLES_COMMON_H
@@ -1142,6 +1142,131 @@ static inline const char *write_canvas(const char *stem, canvas *c)
     const char *path = write_picture(stem, c->width, c->height, c->rgb);
     canvas_destroy(c);
     return path;
+}
+
+/* ---- error and cost ---------------------------------------------------------------------------------------------- */
+
+/* Bytes that a context and all that belongs to it hold at present: settings.allocator = meter_allocator(&bytes). Each
+   piece has its block's address before it. */
+static inline void *meter_alloc(void *user, size_t bytes, size_t alignment)
+{
+    size_t room = alignment + sizeof(void *);
+    char *block = bytes < (size_t)-1 - room ? (char *)malloc(bytes + room) : NULL;
+    if (!block) { return NULL; }
+    char *piece = block + room - (size_t)(block + room) % alignment;
+    memcpy(piece - sizeof block, &block, sizeof block);
+    *(size_t *)user += bytes;
+    return piece;
+}
+
+static inline void meter_free(void *user, void *pointer, size_t bytes)
+{
+    char *block;
+    memcpy(&block, (char *)pointer - sizeof block, sizeof block);
+    *(size_t *)user -= bytes;
+    free(block);
+}
+
+static inline dist_allocator meter_allocator(size_t *bytes)
+{
+    dist_allocator a;
+    a.user = bytes;
+    a.alloc_fn = meter_alloc;
+    a.free_fn = meter_free;
+    return a;
+}
+
+static inline int compare_floats(const void *a, const void *b)
+{
+    float x = *(const float *)a, y = *(const float *)b;
+    return (x > y) - (x < y);
+}
+
+/* Mean, 99th percentile (nearest rank) and largest of n values, which are sorted; -1 of none. */
+static inline void spread_of(size_t n, float *values, double spread[3])
+{
+    spread[0] = spread[1] = spread[2] = -1;
+    if (n == 0) { return; }
+    qsort(values, n, sizeof *values, compare_floats);
+    spread[0] = 0;
+    for (size_t i = 0; i < n; i++) spread[0] += (double)values[i] / (double)n;
+    spread[1] = (double)values[(n * 99 + 99) / 100 - 1];
+    spread[2] = (double)values[n - 1];
+}
+
+/* One half of a line; below 0: not known. */
+static inline void print_cell(const char *name, double value)
+{
+    printf("  %-22s", name);
+    if (value < 0) printf("%14s", "none");
+    else if (value < 1e13 && floor(value) >= value) printf("%14.0f", value);
+    else printf("%14.4g", value);
+}
+
+#define REPORT_USAGE                                                                                       \
+    "  --report           print error and cost of the picture: its hits' error bounds beside their true errors\n" \
+    "                     (along the ray, against a certified picture with epsilon 1e-7), queries by phase, time,\n" \
+    "                     the library's memory\n"
+
+/* Error and cost of a picture side by side. picture: its distance, error, mask and stats. The truth is rendered anew:
+   same camera and field, certified, epsilon 1e-7; a hole is a hit of its alone, a false hit a miss of its. */
+static inline void print_report(dist_context *ctx, const dist_field *field, const dist_camera *camera,
+                                const dist_render_desc *how, const dist_images *picture, double seconds, size_t bytes)
+{
+    static const char *const names[2][13] = {
+        {"hits", "unresolved", "bound, mean", "bound, p99", "bound, largest", "true error, mean", "true error, p99",
+         "true error, largest", "share within bound", "holes", "false hits", "truth: unresolved", "truth: queries"},
+        {"queries", "  cones", "  march", "  refine", "  silhouette", "  normals", "  colors", "queries a pixel",
+         "queries a hit", "multiply-adds asked", "multiply-adds done", "seconds", "bytes of memory"}};
+    size_t n = (size_t)camera->width * (size_t)camera->height, hits = 0, both = 0, within = 0, holes = 0, false_hits = 0;
+    const dist_stats *s = picture->stats;
+    float *bounds = take_floats(n), *errors = take_floats(n);
+    double bound[3], error[3];
+    dist_render_desc exact = *how;
+    dist_images truth;
+    dist_stats spent;
+    memset(&truth, 0, sizeof truth);
+    truth.distance = take_floats(n);
+    truth.status = (unsigned char *)take(n, 1);
+    truth.stats = &spent;
+    exact.trace = DIST_TRACE_GUARDED;
+    exact.certified = 1;
+    exact.epsilon = 1e-7f;
+    exact.step_scale = 0.0f;
+    exact.max_steps = exact.warm_start = 0;
+    exact.max_queries = 0;
+    dist_render(ctx, field, camera, &exact, &truth, NULL);
+    check(ctx);
+    for (size_t i = 0; i < n; i++) {
+        int there = truth.status[i] == DIST_RAY_HIT;
+        holes += there && !picture->mask[i];
+        if (!picture->mask[i]) { continue; }
+        bounds[hits++] = picture->error[i];
+        false_hits += truth.status[i] == DIST_RAY_MISS;
+        if (!there) { continue; }
+        errors[both] = fabsf(picture->distance[i] - truth.distance[i]);
+        within += errors[both++] <= picture->error[i];
+    }
+    spread_of(hits, bounds, bound);
+    spread_of(both, errors, error);
+    double queries = (double)s->queries;
+    double values[2][13] = {
+        {(double)hits, (double)s->unresolved, bound[0], bound[1], bound[2], error[0], error[1], error[2],
+         both ? (double)within / (double)both : -1, (double)holes, (double)false_hits, (double)spent.unresolved,
+         (double)spent.queries},
+        {queries, (double)s->cone_queries, (double)s->march_queries, (double)s->refine_queries,
+         (double)s->silhouette_queries, (double)s->normal_queries, (double)s->color_queries, queries / (double)n,
+         hits ? queries / (double)hits : -1, s->operations, s->operations_done, seconds, (double)bytes}};
+    printf("  %-36s    %s\n", "error", "cost");
+    for (int i = 0; i < 13; i++) {
+        print_cell(names[0][i], values[0][i]);
+        print_cell(names[1][i], values[1][i]);
+        putchar('\n');
+    }
+    free(bounds);
+    free(errors);
+    free(truth.distance);
+    free(truth.status);
 }
 
 /* ---- curves ------------------------------------------------------------------------------------------------------ */

@@ -12,7 +12,8 @@ static const char usage[] =
     "  --start WHICH      zero (default), mean, random:SEED, INDEX or FILE: the code to begin with\n"
     "  --demo             see a shape that the embedded model was never shown, 5 % of its pixels, start from the mean\n"
     "  --demo-family NAME of sofas (default), planes, tables, cars: what the shape is\n"
-    "  --demo-shape N     which one of them (default 0)\n";
+    "  --demo-shape N     which one of them (default 0)\n" REPORT_USAGE
+    "                     of the result's picture; and of the last step its capped gradients and backward points\n";
 
 enum { SNAPSHOTS = 5 };
 
@@ -31,10 +32,12 @@ typedef struct fit {
     dist_render_desc how;  /* with the observed pixels alone where no silhouette is compared */
     unsigned char *pixels; /* those that are observed */
     dist_stats stats;
+    dist_stats last;       /* of the last step, backward included */
+    double render_seconds; /* of the picture in out */
 } fit;
 
 static fit fit_create(dist_context *ctx, const dist_net *net, const fit_options *o, const dist_camera *camera,
-                      const observation *seen, float *code)
+                      const observation *seen, float *code, int report)
 {
     fit f;
     memset(&f, 0, sizeof f);
@@ -51,6 +54,10 @@ static fit fit_create(dist_context *ctx, const dist_net *net, const fit_options 
     f.out.depth = take_floats(seen->n);
     f.d_out.depth = take_floats(seen->n);
     f.out.mask = (unsigned char *)take(seen->n, 1);
+    if (report) {
+        f.out.distance = take_floats(seen->n);
+        f.out.error = take_floats(seen->n);
+    }
     f.how = o->how;
     f.pixels = (unsigned char *)take(seen->n, 1);
     for (size_t i = 0; i < seen->n; i++) {
@@ -73,6 +80,8 @@ static void fit_destroy(fit *f)
     free(f->out.depth);
     free(f->d_out.depth);
     free(f->out.mask);
+    free(f->out.distance);
+    free(f->out.error);
     free(f->pixels);
     free(f->out.silhouette);
     free(f->d_out.silhouette);
@@ -92,7 +101,9 @@ static double fit_loss(fit *f, double terms[3])
     f->d_out.stats = &f->stats;
 
     dist_shape_set_code(f->shape, f->code);
+    double start = seconds_now();
     dist_render(f->ctx, &f->field, &f->camera, &f->how, &f->out, f->tape);
+    f->render_seconds = seconds_now() - start;
     check(f->ctx);
     terms[0] = (double)dist_loss_depth(s->n, f->out.depth, s->seen, f->out.mask, weights[0], f->d_out.depth);
     terms[1] = 0;
@@ -128,6 +139,7 @@ static double fit_run(fit *f, double *loss, float *path, dist_stats *total)
         progress_show(&p, i + 1, iterations, "loss", loss[4 * i]);
     }
     double seconds = seconds_now() - start;
+    f->last = f->stats;
     memcpy(path + (size_t)iterations * f->code_size, f->code, code_bytes);
     progress_end(&p);
     free(adam.moments);
@@ -279,8 +291,9 @@ static void print_row(const char *name, double start, double end)
     putchar('\n');
 }
 
-/* Fits, measures before and after, writes all files. target_points: of the true surface, or NULL. */
-static void fit_and_report(fit *f, const float *target_points)
+/* Fits, measures before and after, writes all files. target_points: of the true surface, or NULL. bytes: what the
+   context's allocator has given. */
+static void fit_and_report(fit *f, const float *target_points, const size_t *bytes)
 {
     const fit_options *o = f->options;
     size_t steps = (size_t)o->iterations;
@@ -313,6 +326,13 @@ static void fit_and_report(fit *f, const float *target_points)
     print_row("mask IoU", scores[0].iou, scores[1].iou);
     print_row("Chamfer", scores[0].chamfer, scores[1].chamfer);
     dist_mesh_destroy(mesh);
+    if (f->out.error) {
+        dist_shape_set_code(f->shape, f->code); /* write_strip has shown others */
+        print_report(f->ctx, &f->field, &f->camera, &o->how, &f->out, f->render_seconds, *bytes);
+        print_cell("capped gradients", (double)f->last.capped);
+        print_cell("backward points", (double)f->last.backward_points);
+        putchar('\n');
+    }
     free(loss);
     free(path);
 }
@@ -353,7 +373,7 @@ static dist_field shape_field(shape *s)
 typedef struct request {
     fit_options fit;
     const char *start;
-    int demo, demo_family, demo_shape;
+    int demo, demo_family, demo_shape, report;
 } request;
 
 static request read_options(int argc, char **argv)
@@ -372,6 +392,8 @@ static request read_options(int argc, char **argv)
             r.demo_family = SHAPE_SOFA + option_choice(&walk, families);
         } else if (option_is(&walk, "--demo-shape")) {
             r.demo_shape = option_int(&walk, 0, 1000000);
+        } else if (option_is(&walk, "--report")) {
+            r.report = option_flag(&walk);
         } else if (!option_fit(&walk, o)) {
             option_unknown(&walk);
         }
@@ -432,6 +454,8 @@ static observation observe(dist_context *ctx, const dist_net *net, request *r, d
 int main(int argc, char **argv)
 {
     request r = read_options(argc, argv);
+    size_t bytes = 0;
+    if (r.report) { r.fit.settings.allocator = meter_allocator(&bytes); }
     dist_context *ctx = dist_context_create(&r.fit.settings);
     dist_net *net = load_model(ctx, r.fit.model);
     if (dist_net_code_size(net) == 0) { fail("%s has no code, so there is nothing to fit", r.fit.model); }
@@ -441,8 +465,8 @@ int main(int argc, char **argv)
     observation seen = observe(ctx, net, &r, &camera, &target_points);
     observation_keep(&seen, r.fit.keep, r.fit.points, (unsigned)r.fit.seed);
 
-    fit f = fit_create(ctx, net, &r.fit, &camera, &seen, code);
-    fit_and_report(&f, target_points);
+    fit f = fit_create(ctx, net, &r.fit, &camera, &seen, code, r.report);
+    fit_and_report(&f, target_points, &bytes);
 
     fit_destroy(&f);
     observation_destroy(&seen);

@@ -32,9 +32,10 @@ static const char usage[] =
     "  --ambient-occlusion N    light from everywhere, as far as N rays from each point meet nothing (16 is rough)\n"
     "  --ambient A        how much light comes from everywhere (default 0.3)\n"
     "  --shine S          strength of highlights (default 0)\n"
+    REPORT_USAGE
     "  --out STEM         files written: STEM_depth.pfm, STEM_depth.png, STEM_shaded.png ..., STEM.json\n";
 
-enum { DEPTH = 1, NORMAL = 2, SILHOUETTE = 4, MASK = 8, COLOR = 16, DISTANCE = 32 };
+enum { DEPTH = 1, NORMAL = 2, SILHOUETTE = 4, MASK = 8, COLOR = 16, DISTANCE = 32, ERROR = 64 };
 
 typedef struct job {
     const char *model, *code, *texture, *color_code, *out;
@@ -42,7 +43,7 @@ typedef struct job {
     int planes, frames, relit, samples, zoom, zoom_at_given;
     float zoom_at[2];
     lighting lighting;
-    int lit;
+    int lit, report;
     dist_render_desc how;
     dist_context_desc settings;
 } job;
@@ -137,6 +138,8 @@ static job read_options(int argc, char **argv)
             j.how.normal_delta = (float)option_number(&o, 1e-6, 1.0);
         } else if (option_is(&o, "--threads")) {
             j.settings.workers = option_int(&o, 1, 1024);
+        } else if (option_is(&o, "--report")) {
+            j.report = option_flag(&o);
         } else if (option_is(&o, "--turntable")) {
             j.frames = option_int(&o, 1, 3600);
         } else if (option_is(&o, "--out")) {
@@ -147,6 +150,7 @@ static job read_options(int argc, char **argv)
     }
     if (j.lit && j.lighting.count == 0) { j.lighting.count = 2; }
     if (j.color_code && !j.texture) { fail("--color-code is of a texture: --texture names it"); }
+    if (j.report && j.frames) { fail("--report is of one picture, and --turntable asks for %d", j.frames); }
     if (j.zoom > j.view.width || j.zoom > j.view.height) { fail("--zoom %d leaves no pixel of the picture", j.zoom); }
     if (j.view.width * j.samples > 16384 || j.view.height * j.samples > 16384) {
         fail("--samples-per-pixel %d makes the picture larger than 16384 pixels a side", j.samples);
@@ -182,6 +186,7 @@ static dist_images planes_create(int width, int height, int planes, dist_stats *
     out.mask = (unsigned char *)take(n, 1);
     if (planes & DEPTH) { out.depth = take_floats(n); }
     if (planes & DISTANCE) { out.distance = take_floats(n); }
+    if (planes & ERROR) { out.error = take_floats(n); }
     if (planes & NORMAL) { out.normal = take_floats(3 * n); }
     if (planes & SILHOUETTE) { out.silhouette = take_floats(n); }
     if (planes & COLOR) { out.color = take_floats(3 * n); }
@@ -193,6 +198,7 @@ static void planes_destroy(dist_images *out)
     free(out->mask);
     free(out->depth);
     free(out->distance);
+    free(out->error);
     free(out->normal);
     free(out->silhouette);
     free(out->color);
@@ -387,17 +393,20 @@ static void turn(dist_context *ctx, const dist_field *field, const job *j)
     write_report(j, ctx, &camera, &total, seconds);
 }
 
-static void render(dist_context *ctx, const dist_field *field, const job *j)
+/* bytes: what the context's allocator has given. */
+static void render(dist_context *ctx, const dist_field *field, const job *j, const size_t *bytes)
 {
     dist_camera camera = view_camera(&j->view, 0.0f);
     dist_stats stats;
     memset(&stats, 0, sizeof stats);
     int extra = j->lit ? DISTANCE | NORMAL | (field->color_fn ? COLOR : 0) : 0;
+    if (j->report) { extra |= DISTANCE | ERROR; }
     dist_images out = planes_create(camera.width, camera.height, j->planes | extra, &stats);
     double start = seconds_now();
     dist_render(ctx, field, &camera, &j->how, &out, NULL);
     double seconds = seconds_now() - start;
     check(ctx);
+    if (j->report) { print_report(ctx, field, &camera, &j->how, &out, seconds, *bytes); }
     write_planes(ctx, j, &out);
     if (j->planes & NORMAL || j->lit) {
         canvas picture = j->samples == 1 ? shade(ctx, field, j, &camera, &out)
@@ -413,6 +422,8 @@ static void render(dist_context *ctx, const dist_field *field, const job *j)
 int main(int argc, char **argv)
 {
     job j = read_options(argc, argv);
+    size_t bytes = 0;
+    if (j.report) { j.settings.allocator = meter_allocator(&bytes); }
     dist_context *ctx = dist_context_create(&j.settings);
     dist_net *net = load_model(ctx, j.model);
     dist_net *texture = j.texture ? load_texture(ctx, j.texture) : NULL;
@@ -433,7 +444,7 @@ int main(int argc, char **argv)
     if (j.frames) {
         turn(ctx, &field, &j);
     } else {
-        render(ctx, &field, &j);
+        render(ctx, &field, &j, &bytes);
     }
 
     free(code);

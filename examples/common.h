@@ -1169,10 +1169,7 @@ static inline void meter_free(void *user, void *pointer, size_t bytes)
 
 static inline dist_allocator meter_allocator(size_t *bytes)
 {
-    dist_allocator a;
-    a.user = bytes;
-    a.alloc_fn = meter_alloc;
-    a.free_fn = meter_free;
+    dist_allocator a = {bytes, meter_alloc, meter_free};
     return a;
 }
 
@@ -1203,10 +1200,9 @@ static inline void print_cell(const char *name, double value)
     else printf("%14.4g", value);
 }
 
-#define REPORT_USAGE                                                                                       \
-    "  --report           print error and cost of the picture: its hits' error bounds beside their true errors\n" \
-    "                     (along the ray, against a certified picture with epsilon 1e-7), queries by phase, time,\n" \
-    "                     the library's memory\n"
+#define REPORT_USAGE                                                                                      \
+    "  --report           prints error and cost: the hits' error bounds and true errors along the ray, by a\n" \
+    "                     certified picture with epsilon 1e-7; queries by phase, seconds, the library's bytes\n"
 
 /* Error and cost of a picture side by side. picture: its distance, error, mask and stats. The truth is rendered anew:
    same camera and field, certified, epsilon 1e-7; a hole is a hit of its alone, a false hit a miss of its. */

@@ -13,7 +13,7 @@ static const char usage[] =
     "  --demo             see a shape that the embedded model was never shown, 5 % of its pixels, start from the mean\n"
     "  --demo-family NAME of sofas (default), planes, tables, cars: what the shape is\n"
     "  --demo-shape N     which one of them (default 0)\n" REPORT_USAGE
-    "                     of the result's picture; and of the last step its capped gradients and backward points\n";
+    "                     (of the result; of the last step: capped gradients, points of the backward pass)\n";
 
 enum { SNAPSHOTS = 5 };
 

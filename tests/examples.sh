@@ -18,6 +18,24 @@ done
 expect arena_runs_in_what_it_asked_for "$work/arena"
 nm -u "$work/arena" 2>/dev/null | grep -E ' (malloc|calloc|realloc|aligned_alloc|posix_memalign|free)(@|$)' >"$work/found"
 expect_nothing arena_links_no_malloc "$work/found"
+# --report: every row is there, each number is one, and shares and parts are not larger than the whole.
+reports() {
+    "$@" --report --out "$work/report" >"$work/rows" && awk '
+        /^  error +cost$/ { on = 1; next }
+        on && /^  / { for (at = 0; at < 2; at++) {
+                    name = substr($0, 1 + 38 * at, 24); gsub(/^ +| +$/, "", name)
+                    number = substr($0, 25 + 38 * at, 14); gsub(/ /, "", number)
+                    if (number !~ /^[0-9][0-9.]*(e[-+][0-9]+)?$/) { print "error: " name " is \"" number "\""; bad = 1 }
+                    v[name] = number + 0; rows++ } }
+        END { if (rows < 26 || !(v["hits"] > 0) || !(v["bytes of memory"] > 0) || !(v["truth: queries"] > 0)) bad = 1
+              if (v["share within bound"] < 0.9 || v["share within bound"] > 1) bad = 1
+              if (v["bound, mean"] > v["bound, largest"] || v["true error, mean"] > v["true error, largest"]) bad = 1
+              sum = v["cones"] + v["march"] + v["refine"] + v["silhouette"] + v["normals"] + v["colors"]
+              if (sum != v["queries"] || v["multiply-adds done"] > v["multiply-adds asked"]) bad = 1
+              exit bad }' "$work/rows"
+}
+expect render_reports reports "$work/render" embedded --size 48
+expect fit_depth_reports reports "$work/fit_depth" --demo --size 32 --iterations 2
 for file in bench/*.c tools/*.c; do
     [ -e "$file" ] || continue
     name=$(basename "$file" .c)

@@ -1214,7 +1214,8 @@ static inline void print_report(dist_context *ctx, const dist_field *field, cons
          "true error, largest", "share within bound", "holes", "false hits", "truth: unresolved", "truth: queries"},
         {"queries", "  cones", "  march", "  refine", "  silhouette", "  normals", "  colors", "queries a pixel",
          "queries a hit", "multiply-adds asked", "multiply-adds done", "seconds", "bytes of memory"}};
-    size_t n = (size_t)camera->width * (size_t)camera->height, hits = 0, both = 0, within = 0, holes = 0, false_hits = 0;
+    size_t n = (size_t)camera->width * (size_t)camera->height;
+    size_t hits = 0, both = 0, within = 0, holes = 0, false_hits = 0;
     const dist_stats *s = picture->stats;
     float *bounds = take_floats(n), *errors = take_floats(n);
     double bound[3], error[3];

@@ -1146,9 +1146,9 @@ static inline const char *write_canvas(const char *stem, canvas *c)
 
 /* ---- error and cost ---------------------------------------------------------------------------------------------- */
 
-/* Bytes that a context and all that belongs to it hold at present: settings.allocator = meter_allocator(&bytes). Each
-   piece has its block's address before it. */
-static inline void *meter_alloc(void *user, size_t bytes, size_t alignment)
+/* Bytes that a context and all that belongs to it hold at present: settings.allocator = counting_allocator(&bytes).
+   Each piece has its block's address before it. */
+static inline void *counting_alloc(void *user, size_t bytes, size_t alignment)
 {
     size_t room = alignment + sizeof(void *);
     char *block = bytes < (size_t)-1 - room ? (char *)malloc(bytes + room) : NULL;
@@ -1159,7 +1159,7 @@ static inline void *meter_alloc(void *user, size_t bytes, size_t alignment)
     return piece;
 }
 
-static inline void meter_free(void *user, void *pointer, size_t bytes)
+static inline void counting_free(void *user, void *pointer, size_t bytes)
 {
     char *block;
     memcpy(&block, (char *)pointer - sizeof block, sizeof block);
@@ -1167,9 +1167,9 @@ static inline void meter_free(void *user, void *pointer, size_t bytes)
     free(block);
 }
 
-static inline dist_allocator meter_allocator(size_t *bytes)
+static inline dist_allocator counting_allocator(size_t *bytes)
 {
-    dist_allocator a = {bytes, meter_alloc, meter_free};
+    dist_allocator a = {bytes, counting_alloc, counting_free};
     return a;
 }
 

@@ -455,7 +455,7 @@ int main(int argc, char **argv)
 {
     request r = read_options(argc, argv);
     size_t bytes = 0;
-    if (r.report) { r.fit.settings.allocator = meter_allocator(&bytes); }
+    if (r.report) { r.fit.settings.allocator = counting_allocator(&bytes); }
     dist_context *ctx = dist_context_create(&r.fit.settings);
     dist_net *net = load_model(ctx, r.fit.model);
     if (dist_net_code_size(net) == 0) { fail("%s has no code, so there is nothing to fit", r.fit.model); }

@@ -423,7 +423,7 @@ int main(int argc, char **argv)
 {
     job j = read_options(argc, argv);
     size_t bytes = 0;
-    if (j.report) { j.settings.allocator = meter_allocator(&bytes); }
+    if (j.report) { j.settings.allocator = counting_allocator(&bytes); }
     dist_context *ctx = dist_context_create(&j.settings);
     dist_net *net = load_model(ctx, j.model);
     dist_net *texture = j.texture ? load_texture(ctx, j.texture) : NULL;

@@ -8344,11 +8344,12 @@ static int disti_ray_is_hit(const disti_tracer *tracer, const disti_ray *ray)
     return ray->status == DIST_RAY_HIT || (ray->status == DIST_RAY_INSIDE && tracer->how.inside == DIST_INSIDE_HIT);
 }
 
-/* Marches the `active` rays listed in bench->index, in rounds: one packed batch of points a round. Without budget they
-   stay as they are. */
-static void disti_trace_rounds(const disti_tracer *tracer, int worker, const disti_bench *bench, size_t active)
+/* Marches the `active` rays listed in bench->index, in rounds: one packed batch of points a round, until only `enough`
+   are left. Returns how many are still listed. Without budget they stay as they are: 0. */
+static size_t disti_trace_rounds(const disti_tracer *tracer, int worker, const disti_bench *bench, size_t active,
+                                 size_t enough)
 {
-    while (active > 0) {
+    while (active > enough) {
         size_t kept = 0;
         for (size_t i = 0; i < active; i++) {
             disti_ray *ray = &bench->rays[bench->index[i]];
@@ -8367,9 +8368,10 @@ static void disti_trace_rounds(const disti_tracer *tracer, int worker, const dis
             if (disti_ray_advance(tracer, ray, bench->sdf[i])) bench->index[kept++] = bench->index[i];
             else if (bench->budget) bench->budget->hits += (unsigned)disti_ray_is_hit(tracer, ray);
         }
-        if (asked < active) return;
+        if (asked < active) return 0;
         active = kept;
     }
+    return active;
 }
 
 /* All rays that are not done. */
@@ -8378,7 +8380,7 @@ static void disti_trace_all(const disti_tracer *tracer, int worker, const disti_
     size_t active = 0;
     for (size_t i = 0; i < n; i++)
         if (bench->rays[i].mode != DISTI_DONE) bench->index[active++] = (int)i;
-    disti_trace_rounds(tracer, worker, bench, active);
+    disti_trace_rounds(tracer, worker, bench, active, 0);
 }
 
 /* Ends the rays for which no budget was left. */
@@ -9028,6 +9030,10 @@ static float disti_pixel_width(const disti_tracer *tracer, const disti_tile *til
     return (float)(sqrt(disti_dot(c, c)) / DISTI_MAX(fabs(tile->view->fx), fabs(tile->view->fy)));
 }
 
+/* So few rays left march on beside the next pass's, instead of in nearly empty blocks of points: 3 % more queries, as
+   nothing is foretold from them then, in a sixth less time for a wide net. */
+enum { DISTI_LATER = 6 };
+
 static void disti_trace_lattice(const disti_tracer *tracer, int worker, const disti_tile *tile, disti_bench *bench)
 {
     size_t active = 0;
@@ -9049,12 +9055,11 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
             else ray->mode = DISTI_WAIT;
         }
     }
-    disti_trace_rounds(tracer, worker, bench, active);
+    active = disti_trace_rounds(tracer, worker, bench, active, DISTI_LATER);
     for (int h = DISTI_LATTICE / 2; h > 0; h /= 2) {
         bench->balls->stride = h;
         bench->balls->window = DISTI_MIN(h + 3, 6);
         for (int pass = 1; pass <= 2; pass++) { /* between two known pixels, then amid four */
-            active = 0;
             for (int y = pass == 1 ? 0 : h; y < tile->height; y += pass == 1 ? h : 2 * h) {
                 for (int x = pass == 1 && y % (2 * h) != 0 ? 0 : h; x < tile->width; x += 2 * h) {
                     int index = y * tile->width + x;
@@ -9063,7 +9068,7 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
                     else if (bench->budget) bench->budget->hits++;
                 }
             }
-            disti_trace_rounds(tracer, worker, bench, active);
+            active = disti_trace_rounds(tracer, worker, bench, active, h > 1 || pass == 1 ? DISTI_LATER : 0);
         }
     }
     bench->balls = NULL;
@@ -10365,7 +10370,7 @@ static int disti_warm_refresh(disti_warm *warm)
         warm->moved[i] = s;
         bench->index[count++] = i;
     }
-    disti_trace_rounds(warm->tracer, warm->worker, bench, count);
+    disti_trace_rounds(warm->tracer, warm->worker, bench, count, 0);
     for (int i = 0; i < warm->n; i++)
         if (warm->moved[i] < 2e38f && bench->rays[i].status == DIST_RAY_HIT &&
             bench->rays[i].best < warm->moved[i] - far)

@@ -578,7 +578,7 @@ typedef struct dist_images {
 /* Keeps what the gradient needs: one distance and one status a pixel, and the paper's K samples where asked for. */
 typedef struct dist_tape dist_tape;
 /* For pictures of exactly this camera's size and of this desc's trace, paper_row and samples.
-   With desc->warm_start the tape also keeps what the next picture can start from (8 bytes a pixel more). A dist_render
+   With desc->warm_start the tape also keeps what the next picture can start from (12 bytes a pixel more). A dist_render
    with warm_start then verifies the last picture's hits and near misses, one query each or none, instead of marching.
    It is meant for an optimization that moves the surface by less than about a pixel a step. Whatever does not
    verify, and every tile in which much has moved, is traced anew; so is the whole picture after a change of camera, of

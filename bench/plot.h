@@ -298,7 +298,7 @@ static inline void plot_range(plot_panel *a)
         double span = is_log ? 0.3 : 1e-3 * fabs(*high) + 1e-12;
         if (*high - *low < span) { pad = 0.5 * (span - (*high - *low)); }
         *high += pad;
-        if (is_log && a->edge[axis]) {
+        if (is_log && a->edge[axis] != 0.0) {
             *low = a->least[axis] > 0 ? log10(a->least[axis]) : floor(*low - 0.5);
         } else if (is_log || !(a->flags & PLOT_ZERO_Y && axis == 1 && *low >= 0)) {
             *low -= pad;
@@ -372,7 +372,7 @@ static inline void plot_axes(FILE *f, const plot_panel *a)
         double half = plain ? 0.5 * plot_text_width(number, 11) : round ? 14 : 24;
         double x = plot_at(a, 0, ticks[i]);
         fprintf(f, "<path d='M%.1f %.1fV%.1f' stroke='#e4e4e4'/>", x, a->top, bottom);
-        if ((a->edge[0] && x < a->left + 28) || x - half < taken + 4) { continue; } /* the edge's own word is there */
+        if ((a->edge[0] != 0.0 && x < a->left + 28) || x - half < taken + 4) { continue; } /* the edge's own word is there */
         taken = x + half;
         fprintf(f, "<text x='%.1f' y='%.1f' text-anchor='middle'>", x, bottom + 15);
         plot_number(f, ticks[i], plain);
@@ -388,13 +388,13 @@ static inline void plot_axes(FILE *f, const plot_panel *a)
             plot_text(f, a->left - 7, y + 4, "end", "", a->categories[i]);
             continue;
         }
-        if (a->edge[1] && y > bottom - 10) { continue; }
+        if (a->edge[1] != 0.0 && y > bottom - 10) { continue; }
         fprintf(f, "<text x='%.1f' y='%.1f' text-anchor='end'>", a->left - 6, y + 4);
         plot_number(f, ticks[i], plain);
         fputs("</text>\n", f);
     }
     for (int axis = 0; axis < 2; axis++) {
-        if (!a->edge[axis]) { continue; }
+        if (a->edge[axis] == 0.0) { continue; }
         fprintf(f, "<text x='%.1f' y='%.1f' text-anchor='%s'>", axis ? a->left - 6 : a->left,
                 axis ? bottom + 4 : bottom + 15, axis ? "end" : "middle");
         if (a->least[axis] > 0) {

@@ -457,7 +457,7 @@ enum { DIST_INSIDE_BACKGROUND = 0, DIST_INSIDE_HIT = 1, DIST_INSIDE_EXIT = 2 };
 
 enum {
     DIST_RAY_MISS = 0,   /* nothing there */
-    DIST_RAY_HIT,        /* the distance is within its error bound */
+    DIST_RAY_HIT,        /* the distance is within its error bound, see dist_images.error */
     DIST_RAY_UNRESOLVED, /* budget spent: mask 0, distance of the sample of smallest |f|, or where neighbors or cones
                             say; a surface, if there is one, is no farther from there than the error */
     DIST_RAY_INSIDE,     /* started inside the solid: as how.inside says */
@@ -520,13 +520,13 @@ typedef struct dist_stats {
     double operations_done;             /* of them, those not left out as dead units */
     float epsilon;                      /* the |f| in force, smallest over the picture */
     float lipschitz;                    /* in force */
-    float error;                        /* largest error bound over the hits */
+    float error;                        /* largest error over the hits; see dist_images.error */
 } dist_stats;
 
 /* One free ray's result. Distances are along the unit direction. */
 typedef struct dist_hit {
     float distance; /* of the hit, or of the sample of smallest |f| */
-    float error;    /* bound on the distance's error */
+    float error;    /* bound on the distance's error, as good as f's slopes are sampled; no neighbors are asked */
     float sdf;      /* f there */
     int status;     /* DIST_RAY_* */
 } dist_hit;
@@ -570,8 +570,10 @@ typedef struct dist_images {
     float *color;          /* (h, w, 3) */
     unsigned char *mask;   /* 1 hit, 0 not: the authority */
     unsigned char *status; /* DIST_RAY_* */
-    float *error;          /* bound on the error of distance; 0 where that is the background. Behind the edge of a
-                              nearer surface it reaches to that */
+    float *error;          /* bound on the error of distance, as good as f's slopes are sampled; 0 where that is the
+                              background. Behind the edge of a nearer surface it reaches to that where neighbors
+                              predict each other: pixels below a hundredth of the radius, how.certified 0.
+                              DIST_TRACE_PAPER: |f| of a hit's sample, no bound */
     dist_stats *stats;
 } dist_images;
 

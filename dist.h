@@ -571,9 +571,8 @@ typedef struct dist_images {
     unsigned char *mask;   /* 1 hit, 0 not: the authority */
     unsigned char *status; /* DIST_RAY_* */
     float *error;          /* bound on the error of distance, as good as f's slopes are sampled; 0 where that is the
-                              background. Behind the edge of a nearer surface it reaches to that where neighbors
-                              predict each other: pixels below a hundredth of the radius, how.certified 0.
-                              DIST_TRACE_PAPER: |f| of a hit's sample, no bound */
+                              background. Behind the edge of a nearer surface it reaches to that, but with
+                              how.certified. DIST_TRACE_PAPER: |f| of a hit's sample, no bound */
     dist_stats *stats;
 } dist_images;
 
@@ -10526,7 +10525,7 @@ static void disti_render_task(void *arg, int index, int worker)
         if (job->warm) disti_render_warm(job, worker, &tile, &bench);
         if (job->predict) disti_trace_lattice(tracer, worker, &tile, &bench);
         else disti_trace_all(tracer, worker, &bench, (size_t)n);
-        if (job->predict && !tracer->how.certified && (job->out->error || job->out->stats))
+        if (!tracer->how.certified && (job->out->error || job->out->stats))
             disti_trace_doubt(&tile, &bench);
         budget.marching = 0;
         disti_tile_trim(job, &tile, &bench);

@@ -7807,7 +7807,8 @@ static int disti_ray_feel(const disti_tracer *tracer, disti_ray *ray, float epsi
 /* Past the least f of the band, which lies between a and b, at s as far as is known; f is not negative at all three.
    Where it is convex it stays above its chords continued: as soon as these stay above 0, the ray only came near. Until
    then, or until f < 0, it is looked for in turn where two equal slopes meet, where a parabola is least, and by golden
-   sections. A steep least f below half of epsilon may be a sheet that is thinner than floats can tell: a hit. */
+   sections. A steep least f below half of epsilon may be a sheet that is thinner than floats can tell: a hit. Where the
+   sides are flat, a least f says nothing, float noise has many: the ray goes on. */
 static int disti_ray_least(const disti_tracer *tracer, disti_ray *ray)
 {
     float before = ray->s - ray->a, after = ray->b - ray->s;
@@ -7815,10 +7816,11 @@ static int disti_ray_least(const disti_tracer *tracer, disti_ray *ray)
     float drop = DISTI_MAX(right * before, left * after);
     int spent = ray->moved > 12 || ray->b - ray->a < 4e-6f * tracer->field->radius;
     float epsilon = disti_ray_epsilon(tracer, ray, ray->s);
-    int narrow = DISTI_MIN(left, right) > 0.3f * tracer->lipschitz || ray->b - ray->a < epsilon;
+    float sides = DISTI_MIN(left, right) / tracer->lipschitz;
+    int narrow = sides > 0.3f || (sides > 0.02f && ray->b - ray->a < epsilon);
     int sheet = narrow && ray->f < 0.5f * epsilon; /* too thin to be sure of */
     if (spent || drop < ray->f) {
-        if (sheet || ray->f <= tracer->noise)
+        if (sheet || (ray->f <= tracer->noise && sides > 0.02f))
             return disti_ray_end(ray, DIST_RAY_HIT, ray->s, ray->f, ray->f / tracer->lipschitz + ray->b - ray->a);
     }
     if (spent || drop < ray->f) {

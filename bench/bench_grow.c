@@ -435,7 +435,7 @@ static const char *series_name(const row *r)
 
 static void plot_sweep(const settings *set, const sweep_text *s, const table *t)
 {
-    char subtitle[160], file[64], path[PATH_SIZE];
+    char subtitle[160] = "", file[64], path[PATH_SIZE];
     plot p = plot_begin(s->title, subtitle, 3);
     plot_panel *seconds = plot_add_panel(&p, "time", s->x_label, "seconds", s->flags | PLOT_LOG_Y);
     plot_add_panel(&p, "queries", s->x_label, "queries per pixel and view", s->flags | PLOT_LOG_Y);

@@ -7816,11 +7816,11 @@ static int disti_ray_least(const disti_tracer *tracer, disti_ray *ray)
     float drop = DISTI_MAX(right * before, left * after);
     int spent = ray->moved > 12 || ray->b - ray->a < 4e-6f * tracer->field->radius;
     float epsilon = disti_ray_epsilon(tracer, ray, ray->s);
-    float sides = DISTI_MIN(left, right) / tracer->lipschitz;
-    int narrow = sides > 0.3f || (sides > 0.02f && ray->b - ray->a < epsilon);
+    int flat = DISTI_MAX(ray->fa, ray->fb) - ray->f < tracer->noise;
+    int narrow = DISTI_MIN(left, right) > 0.3f * tracer->lipschitz || (!flat && ray->b - ray->a < epsilon);
     int sheet = narrow && ray->f < 0.5f * epsilon; /* too thin to be sure of */
     if (spent || drop < ray->f) {
-        if (sheet || (ray->f <= tracer->noise && sides > 0.02f))
+        if (sheet || (!flat && ray->f <= tracer->noise))
             return disti_ray_end(ray, DIST_RAY_HIT, ray->s, ray->f, ray->f / tracer->lipschitz + ray->b - ray->a);
     }
     if (spent || drop < ray->f) {

@@ -96,7 +96,8 @@ if [ -n "$quick" ]; then
         skip_row sanitizers "$cc has no sanitizers here"
     fi
     row fast_math build/matrix/fast_math $cc "-O2 -ffast-math" "" 1 ""
-    row O0 build/matrix/O0 $cc "-O0" "" 1 ""
+    # What does not optimize is slow: there the parts that depend on the compiler, inline functions and scratch.
+    row O0 build/matrix/O0 $cc "-O0" "" 1 "" test_kernels test_half test_net test_context test_render test_workspace
     isa_row scalar build $cc "-O2" scalar 1
     isa_row avx2 build $cc "-O2" avx2 1
 else

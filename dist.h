@@ -1347,7 +1347,9 @@ static dist_status disti_partial_reserve(dist_context *ctx, size_t size)
 /* For the sums of a gradient for `codes` numbers, and one more for what a piece leaves over. */
 static dist_status disti_partial_for(dist_context *ctx, size_t codes)
 {
-    return disti_partial_reserve(ctx, codes + codes / DISTI_SLOTS + 1);
+    size_t size;
+    if (!disti_size_add(codes, codes / DISTI_SLOTS + 1, &size)) size = (size_t)-1;
+    return disti_partial_reserve(ctx, size);
 }
 
 #ifndef DIST_NO_TRAIN
@@ -6467,6 +6469,12 @@ static size_t disti_half_steps(const disti_linear *layer, int kind)
     return (size_t)(kind == DIST_HALF_BF16 ? (layer->prev + 1) / 2 : layer->prev);
 }
 
+/* Numbers of 32 bits in half_panels. */
+static size_t disti_half_size(const disti_linear *layer, int kind)
+{
+    return disti_half_steps(layer, kind) * (((size_t)layer->out + 7) & ~(size_t)7);
+}
+
 /* The largest weight that is packed. */
 static float disti_half_largest(const dist_net *net)
 {
@@ -6485,9 +6493,12 @@ static float disti_half_largest(const dist_net *net)
 /* panels to half_panels, the previous units' columns: (w, w) in f16, rows 2 k and 2 k + 1 in bf16. */
 static void disti_half_pack(dist_net *net)
 {
+    size_t offset = 0;
     for (int l = 0; l + 1 < net->layers; l++) {
-        const disti_linear *layer = &net->layer[l];
+        disti_linear *layer = &net->layer[l];
         size_t rows = (size_t)(layer->prev + layer->point), steps = disti_half_steps(layer, net->half);
+        layer->half_panel = offset;
+        offset += disti_half_size(layer, net->half);
         for (size_t o = 0; o < (size_t)layer->out; o += 8) {
             for (size_t at = 0; at < steps * 8; at++) {
                 const float *w = net->panels + layer->panel + o * rows;
@@ -6550,11 +6561,8 @@ DIST_API dist_status dist_net_set_half(dist_context *ctx, dist_net *net, int kin
         return disti_fail(ctx, DIST_UNSUPPORTED, "%s: nets with LayerNorm have no 16-bit kernel", name, 0, 0);
     float *panels = NULL;
     size_t count = 0;
-    for (int l = 0; l + 1 < net->layers && kind != DIST_HALF_OFF; l++) {
-        disti_linear *layer = &net->layer[l];
-        layer->half_panel = count;
-        count += disti_half_steps(layer, kind) * (((size_t)layer->out + 7) & ~(size_t)7);
-    }
+    for (int l = 0; l + 1 < net->layers && kind != DIST_HALF_OFF; l++) /* at most panel_count in all: that exists */
+        count += disti_half_size(&net->layer[l], kind);
     if (count > 0) {
         panels = (float *)net->allocator.alloc_fn(net->allocator.user, count * sizeof(float), DISTI_ALIGNMENT);
         if (!panels) return disti_fail(ctx, DIST_OUT_OF_MEMORY, "%s: out of memory", name, 0, 0);
@@ -7822,8 +7830,6 @@ static int disti_ray_least(const disti_tracer *tracer, disti_ray *ray)
     if (spent || drop < ray->f) {
         if (sheet || (!flat && ray->f <= tracer->noise))
             return disti_ray_end(ray, DIST_RAY_HIT, ray->s, ray->f, ray->f / tracer->lipschitz + ray->b - ray->a);
-    }
-    if (spent || drop < ray->f) {
         float s = ray->s, f = ray->f;
         ray->s = ray->b;
         ray->f = ray->fb;
@@ -9033,8 +9039,8 @@ static float disti_pixel_width(const disti_tracer *tracer, const disti_tile *til
     return (float)(sqrt(disti_dot(c, c)) / DISTI_MAX(fabs(tile->view->fx), fabs(tile->view->fy)));
 }
 
-/* So few rays left march on beside the next pass's, instead of in nearly empty blocks of points: 3 % more queries, as
-   nothing is foretold from them then, in a sixth less time for a wide net. */
+/* So few rays left march on beside the next pass's, instead of in nearly empty blocks of points: somewhat more queries,
+   as nothing is foretold from them then, in less time. */
 enum { DISTI_LATER = 6 };
 
 static void disti_trace_lattice(const disti_tracer *tracer, int worker, const disti_tile *tile, disti_bench *bench)
@@ -13156,7 +13162,10 @@ static dist_status disti_measure_shapes(dist_context *ctx, const dist_net *net, 
     status = disti_scene_take(&scene);
     if (status != DIST_OK) return status;
     dist_field field = dist_shape_field(&shape);
-    return disti_partial_for(ctx, (size_t)instances * (disti_field_code(&field) + 7 + (size_t)field.color_code_size));
+    size_t codes;
+    if (!disti_size_mul((size_t)instances, disti_field_code(&field) + 7 + (size_t)field.color_code_size, &codes))
+        codes = (size_t)-1;
+    return disti_partial_for(ctx, codes);
 }
 
 DIST_API size_t dist_workspace_bytes(const dist_workspace_desc *desc)

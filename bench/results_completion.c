@@ -138,25 +138,6 @@ typedef struct problem {
     float *start;            /* its family's mean code */
 } problem;
 
-/* The field of a shape: distances, and slopes by differences. */
-static void truth_values(void *user, int worker_index, size_t n, const float *points, float *sdf, float *gradient)
-{
-    const shape *s = (const shape *)user;
-    const float h = 1e-3f;
-    (void)worker_index;
-    for (size_t i = 0; i < n; i++) {
-        const float *p = points + 3 * i;
-        sdf[i] = shape_distance(s, p);
-        for (int k = 0; gradient && k < 3; k++) {
-            float low[3] = {p[0], p[1], p[2]};
-            float high[3] = {p[0], p[1], p[2]};
-            low[k] -= h;
-            high[k] += h;
-            gradient[3 * i + (size_t)k] = (shape_distance(s, high) - shape_distance(s, low)) / (2.0f * h);
-        }
-    }
-}
-
 /* The cameras of the paper's pictures: any side, 25 to 30 degrees above. */
 static dist_camera problem_camera(int size, int family, unsigned index)
 {
@@ -193,7 +174,6 @@ static problem problem_create(const bench *b, worker *w, int size, int family, u
     dist_images out;
     dist_render_desc how;
     memset(&p, 0, sizeof p);
-    memset(&field, 0, sizeof field);
     memset(&out, 0, sizeof out);
     memset(&how, 0, sizeof how);
     p.family = family;
@@ -205,9 +185,7 @@ static problem problem_create(const bench *b, worker *w, int size, int family, u
     p.start = family_mean(b->net, family);
     float *distance = take_floats(p.seen.n);
     shape_make(&truth, family, index);
-    field.user = &truth;
-    field.eval_fn = truth_values;
-    field.radius = 1.0f;
+    field = shape_field(&truth);
     how.normal_space = DIST_SPACE_WORLD;
     out.depth = p.seen.depth;
     out.distance = distance;

@@ -13,7 +13,7 @@ static const char usage[] =
     "  --demo             see a shape that the embedded model was never shown, 5 % of its pixels, start from the mean\n"
     "  --demo-family NAME of sofas (default), planes, tables, cars: what the shape is\n"
     "  --demo-shape N     which one of them (default 0)\n"
-    "  --warm             begin each step's picture with the last one: 0.4 of the queries; off because thin shapes seen\n"
+    "  --warm             begin each step's picture with the last one: fewer queries; off because thin shapes seen\n"
     "                     in few points are found worse\n" REPORT_USAGE
     "                     (of the result; of the last step: capped gradients, points of the backward pass)\n";
 
@@ -344,36 +344,6 @@ static void fit_and_report(fit *f, const float *target_points, const size_t *byt
 }
 
 /* ---- where the observation comes from ---------------------------------------------------------------------------- */
-
-/* The field of an analytic shape: all that a field of one's own needs is this function and a bounding sphere. */
-static void shape_values(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
-{
-    const shape *s = (const shape *)user;
-    const float h = 1e-3f;
-    (void)worker;
-    for (size_t i = 0; i < n; i++) {
-        const float *p = points + 3 * i;
-        sdf[i] = shape_distance(s, p);
-        for (int k = 0; gradient && k < 3; k++) {
-            float low[3] = {p[0], p[1], p[2]};
-            float high[3] = {p[0], p[1], p[2]};
-            low[k] -= h;
-            high[k] += h;
-            gradient[3 * i + (size_t)k] = (shape_distance(s, high) - shape_distance(s, low)) / (2.0f * h);
-        }
-    }
-}
-
-static dist_field shape_field(shape *s)
-{
-    dist_field field;
-    memset(&field, 0, sizeof field);
-    field.user = s;
-    field.eval_fn = shape_values;
-    field.radius = 1.0f;
-    field.lipschitz = 1.0f;
-    return field;
-}
 
 /* What the user asks for. */
 typedef struct request {

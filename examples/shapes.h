@@ -654,4 +654,36 @@ static inline void shape_color(const shape_coloring *c, const float p[3], float 
     }
 }
 
+#ifdef DIST_H
+/* The field of an analytic shape: all that a field of one's own needs is this function and a bounding sphere. */
+static inline void shape_values(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    const shape *s = (const shape *)user;
+    const float h = 1e-3f;
+    (void)worker;
+    for (size_t i = 0; i < n; i++) {
+        const float *p = points + 3 * i;
+        sdf[i] = shape_distance(s, p);
+        for (int k = 0; gradient && k < 3; k++) {
+            float low[3] = {p[0], p[1], p[2]};
+            float high[3] = {p[0], p[1], p[2]};
+            low[k] -= h;
+            high[k] += h;
+            gradient[3 * i + (size_t)k] = (shape_distance(s, high) - shape_distance(s, low)) / (2.0f * h);
+        }
+    }
+}
+
+static inline dist_field shape_field(shape *s)
+{
+    dist_field field;
+    memset(&field, 0, sizeof field);
+    field.user = s;
+    field.eval_fn = shape_values;
+    field.radius = 1.0f;
+    field.lipschitz = 1.0f;
+    return field;
+}
+#endif
+
 #endif

@@ -61,34 +61,6 @@ typedef struct settings {
 /* ---- samples
  * ---------------------------------------------------------------------------------------------------------- */
 
-static void shape_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
-{
-    const shape *s = (const shape *)user;
-    const float h = 1e-3f;
-    (void)worker;
-    for (size_t i = 0; i < n; i++) {
-        sdf[i] = shape_distance(s, points + 3 * i);
-        for (int k = 0; gradient && k < 3; k++) {
-            float p[3] = {points[3 * i], points[3 * i + 1], points[3 * i + 2]};
-            p[k] += h;
-            float ahead = shape_distance(s, p);
-            p[k] -= 2.0f * h;
-            gradient[3 * i + (size_t)k] = (ahead - shape_distance(s, p)) / (2.0f * h);
-        }
-    }
-}
-
-/* Borrows the shape. */
-static dist_field shape_field(shape *s)
-{
-    dist_field field;
-    memset(&field, 0, sizeof field);
-    field.user = s;
-    field.eval_fn = shape_eval;
-    field.radius = 1.0f;
-    return field;
-}
-
 /* n points on a field's surface; 0 if there is none. */
 static int surface_points(dist_context *ctx, const dist_field *field, int resolution, unsigned seed, size_t n,
                           float *points)

@@ -5848,6 +5848,19 @@ typedef struct disti_weights_job {
     int blocks;
 } disti_weights_job;
 
+static disti_weights_job disti_weights_begin(const dist_shape *shape, size_t n, const float *points, float *d_points,
+                                             float *d_weights)
+{
+    disti_weights_job job;
+    memset(&job, 0, sizeof job);
+    job.shape = shape;
+    job.n = n;
+    job.points = points;
+    job.d_points = d_points;
+    job.d_weights = d_weights;
+    return job;
+}
+
 /* Points whose numbers somewhere in the net are so large that their products overflow give no weight gradient, rather
    than spoil that of all the others: their inputs and deltas in the store become 0. */
 static void disti_weights_drop(const dist_net *net, size_t columns, float *store)
@@ -6018,16 +6031,10 @@ static dist_status disti_shape_weights_fn(void *user, dist_context *ctx, size_t 
                                           dist_seed_fn seed_fn, void *seed_user, float *d_points, double *d_code,
                                           float *d_weights)
 {
-    disti_weights_job job;
-    memset(&job, 0, sizeof job);
-    job.shape = (const dist_shape *)user;
-    job.n = n;
-    job.points = points;
+    disti_weights_job job = disti_weights_begin((const dist_shape *)user, n, points, d_points, d_weights);
     job.d_sdf = d_sdf;
     job.seed_fn = seed_fn;
     job.seed_user = seed_user;
-    job.d_points = d_points;
-    job.d_weights = d_weights;
     disti_weights_run(&job, ctx, d_code);
     return DIST_OK;
 }
@@ -6037,14 +6044,8 @@ static dist_status disti_shape_second_weights(void *user, dist_context *ctx, siz
                                               const float *directions, float *d_points, double *d_code,
                                               float *d_weights)
 {
-    disti_weights_job job;
-    memset(&job, 0, sizeof job);
-    job.shape = (const dist_shape *)user;
-    job.n = n;
-    job.points = points;
+    disti_weights_job job = disti_weights_begin((const dist_shape *)user, n, points, d_points, d_weights);
     job.directions = directions;
-    job.d_points = d_points;
-    job.d_weights = d_weights;
     disti_weights_run(&job, ctx, d_code);
     return DIST_OK;
 }
@@ -6053,14 +6054,8 @@ static dist_status disti_shape_second_weights(void *user, dist_context *ctx, siz
 static void disti_shape_color_weights_fn(void *user, dist_context *ctx, size_t n, const float *points,
                                          const float *d_color, float *d_points, double *d_code, float *d_weights)
 {
-    disti_weights_job job;
-    memset(&job, 0, sizeof job);
-    job.shape = disti_shape_paint(user);
-    job.n = n;
-    job.points = points;
+    disti_weights_job job = disti_weights_begin(disti_shape_paint(user), n, points, d_points, d_weights);
     job.d_color = d_color;
-    job.d_points = d_points;
-    job.d_weights = d_weights;
     disti_weights_run(&job, ctx, d_code);
 }
 #endif

@@ -164,6 +164,26 @@ TEST_UNUSED static double model_eval(const model *m, const double *params, const
     return model_channels(m, params, code, p, NULL, NULL, NULL);
 }
 
+/* f of a sphere, torus or box by its numbers, as dist_field_sphere and others have them, or of a net by its code. */
+enum { SPHERE, TORUS, BOX, NET, KINDS };
+TEST_UNUSED static double model_field(int kind, const model *m, const double *c, const double p[3])
+{
+    if (kind == NET) return model_eval(m, m->params, c, p);
+    double q[3] = {p[0] - c[0], p[1] - c[1], p[2] - c[2]};
+    if (kind == SPHERE) return sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2]) - c[3];
+    if (kind == TORUS) {
+        double h = sqrt(q[0] * q[0] + q[2] * q[2]) - c[3];
+        return sqrt(h * h + q[1] * q[1]) - c[4];
+    }
+    double outside = 0.0, most = -1e300;
+    for (int i = 0; i < 3; i++) {
+        double a = fabs(q[i]) - c[3 + i];
+        outside += a > 0.0 ? a * a : 0.0;
+        most = fmax(most, a);
+    }
+    return sqrt(outside) + fmin(most, 0.0);
+}
+
 /* df/dp by central differences. */
 TEST_UNUSED static void model_gradient(const model *m, const double *params, const double *code, const double p[3],
                                        double gradient[3])

@@ -6,7 +6,6 @@
 
 /* ---- a scene in double: a field, its numbers, and a camera ------------------------------------------------------- */
 
-enum { SPHERE, TORUS, BOX, NET };
 enum { CODE, ROTATION, TRANSLATION, FOCAL, PRINCIPAL, WEIGHTS, GROUPS };
 enum { SIZE = 20, PIXELS = SIZE * SIZE };
 
@@ -27,24 +26,7 @@ typedef struct scene {
     dist_field field;
 } scene;
 
-static double field_value(const scene *s, const double p[3])
-{
-    const double *c = s->code;
-    if (s->kind == NET) return model_eval(&s->m, s->m.params, c, p);
-    double q[3] = {p[0] - c[0], p[1] - c[1], p[2] - c[2]};
-    if (s->kind == SPHERE) return sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2]) - c[3];
-    if (s->kind == TORUS) {
-        double h = sqrt(q[0] * q[0] + q[2] * q[2]) - c[3];
-        return sqrt(h * h + q[1] * q[1]) - c[4];
-    }
-    double outside = 0.0, most = -1e300;
-    for (int i = 0; i < 3; i++) {
-        double a = fabs(q[i]) - c[3 + i];
-        outside += a > 0.0 ? a * a : 0.0;
-        most = fmax(most, a);
-    }
-    return sqrt(outside) + fmin(most, 0.0);
-}
+static double field_value(const scene *s, const double p[3]) { return model_field(s->kind, &s->m, s->code, p); }
 
 static void field_gradient(const scene *s, const double p[3], double h, double g[3])
 {

@@ -5,7 +5,6 @@
 
 #include "model.h"
 
-enum { SPHERE, TORUS, BOX, NET, KINDS };
 enum { PARTS = 24, NUMBERS = 24 };
 
 /* An instance in double, and its float twin. */
@@ -27,25 +26,6 @@ typedef struct world {
     dist_field field;
 } world;
 
-static double part_inner(const part *a, const double q[3])
-{
-    const double *c = a->code;
-    if (a->kind == NET) return model_eval(a->m, a->m->params, c, q);
-    double x[3] = {q[0] - c[0], q[1] - c[1], q[2] - c[2]};
-    if (a->kind == SPHERE) return sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2]) - c[3];
-    if (a->kind == TORUS) {
-        double h = sqrt(x[0] * x[0] + x[2] * x[2]) - c[3];
-        return sqrt(h * h + x[1] * x[1]) - c[4];
-    }
-    double outside = 0, most = -1e300;
-    for (int i = 0; i < 3; i++) {
-        double e = fabs(x[i]) - c[3 + i];
-        outside += e > 0 ? e * e : 0;
-        most = fmax(most, e);
-    }
-    return sqrt(outside) + fmin(most, 0);
-}
-
 /* f_i at p. margin: NULL, or made smaller where a kink is nearer: of d, of b against its cap, of ReLUs and the box.
    capped 0: the lower bound goes on without a cap, as nobody computes it. */
 static double part_value(const part *a, const double p[3], int capped, double *margin)
@@ -60,7 +40,7 @@ static double part_value(const part *a, const double p[3], int capped, double *m
     length = sqrt(length);
     double d = length - r, b;
     for (int i = 0; i < 3 && d > 0; i++) q[i] = (double)a->field.center[i] + r * n[i] / length;
-    b = part_inner(a, q);
+    b = model_field(a->kind, a->m, a->code, q);
     if (margin && a->kind == NET) model_channels(a->m, a->m->params, a->code, q, NULL, NULL, &closest);
     if (margin && a->kind == BOX)
         for (int i = 0; i < 3; i++) closest = fmin(closest, fabs(fabs(q[i] - a->code[i]) - a->code[3 + i]));

@@ -8718,22 +8718,12 @@ DIST_API dist_status dist_field_collide(dist_context *ctx, const dist_field *fie
     return disti_foot_run(&job, "dist_field_collide", contacts);
 }
 
-/* Cones: a block of pixels marches as one while the sphere that f / L proves empty is wider than the block's cone
-   there; then its children start where it stopped. Safe for anything, however thin, under the Lipschitz bound: every
-   point of every ray of the block before the stop lies in one of the empty spheres. */
-typedef struct disti_cone {
-    disti_ray axis;
-    double enter, leave; /* along any of the block's rays, measured from the camera */
-    double t;
-    double chord, cosine, sine; /* of the cone's half angle: chord = 2 sin(angle / 2) */
-    int x, y;     /* first pixel, within the tile */
-    int size;
-    int blocked;
-    int rays;     /* not done yet */
-    float f;      /* last sample */
-    double least_t; /* where the block's axes had the least f, and that f */
-    float least_f;
-} disti_cone;
+/* Half a pixel's width at unit distance: cos^2 / (2 f), with the larger of the focal lengths. */
+static double disti_view_footprint(const disti_view *view, double cosine)
+{
+    double f = DISTI_MAX(fabs(view->fx), fabs(view->fy));
+    return 0.5 * cosine * cosine / f;
+}
 
 /* A tile of the picture. Where the picture goes on, one more column and row are traced (never written), so that every
    pixel has neighbors on both sides to be predicted from. */
@@ -8742,6 +8732,7 @@ typedef struct disti_tile {
     const size_t *list; /* pixels of the rays, which then stand in one row; NULL: a rectangle */
     int x, y, width, height; /* traced: at most DISTI_TILE + 1 each */
     int own_width, own_height; /* written */
+    int lazy; /* 1: only the rays that the cones leave are made; of the others no more is known than that they miss */
 } disti_tile;
 
 static size_t disti_tile_pixel(const disti_tile *tile, int i)
@@ -8750,50 +8741,145 @@ static size_t disti_tile_pixel(const disti_tile *tile, int i)
     return (size_t)(tile->y + i / tile->width) * (size_t)tile->view->width + (size_t)(tile->x + i % tile->width);
 }
 
+/* A pixel that nobody asked for. */
+static void disti_ray_skip(disti_ray *ray)
+{
+    memset(ray, 0, sizeof *ray);
+    ray->fbest = 3e38f;
+    ray->status = DIST_RAY_SKIPPED; /* mode is DISTI_DONE, and the sphere is not met: enter = leave */
+}
+
+/* A ray that misses, and of which no more is wanted. */
+static void disti_ray_close(disti_ray *ray)
+{
+    ray->mode = DISTI_DONE;
+    ray->status = DIST_RAY_MISS;
+    ray->enter = ray->leave = 0.0f;
+}
+
+/* Makes the rays of pixels x0..x1-1, y0..y1-1 of the tile, as disti_pixel_ray does. */
+static void disti_tile_rays(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench, int x0,
+                            int y0, int x1, int y1)
+{
+    const disti_view *view = tile->view;
+    const double *m = view->rotation;
+    const unsigned char *pixels = tracer->how.pixels;
+    double c[3], per_pixel = disti_view_footprint(view, 1.0);
+    for (int i = 0; i < 3; i++) c[i] = view->center[i] - (double)tracer->field->center[i];
+    for (int y = y0; y < y1; y++) {
+        double v = ((double)(tile->y + y) + view->first - view->cy) / view->fy;
+        double skewed = view->cx + view->skew * v - view->first;
+        double row[3] = {m[3] * v + m[6], m[4] * v + m[7], m[5] * v + m[8]};
+        disti_ray *ray = bench->rays + y * tile->width + x0;
+        for (int x = tile->x + x0; x < tile->x + x1; x++, ray++) {
+            if (pixels && !pixels[(size_t)(tile->y + y) * (size_t)view->width + (size_t)x]) {
+                disti_ray_skip(ray);
+                continue;
+            }
+            double u = ((double)x - skewed) / view->fx, cosine = 1.0 / sqrt(u * u + v * v + 1.0);
+            memset(ray, 0, sizeof *ray);
+            disti_ray_place(tracer->field, c[0], c[1], c[2], (m[0] * u + row[0]) * cosine,
+                            (m[1] * u + row[1]) * cosine, (m[2] * u + row[2]) * cosine, per_pixel * cosine * cosine,
+                            ray);
+            ray->cosine = (float)cosine;
+        }
+    }
+}
+
+/* Cones: a block of pixels marches as one while the sphere that f / L proves empty is wider than the block's cone
+   there; then its children start where it stopped. Safe for anything, however thin, under the Lipschitz bound: every
+   point of every ray of the block before the stop lies in one of the empty spheres. */
+typedef struct disti_cone {
+    float origin[3], direction[3]; /* of the axis, as of a ray */
+    double base;
+    double leave; /* no ray of the block is in the bounding sphere beyond, measured from the camera */
+    double t;
+    double chord, cosine, sine; /* of the cone's half angle: chord = 2 sin(angle / 2) */
+    int x, y;     /* first pixel, within the tile */
+    int size;
+    int state;    /* DISTI_CONE_* */
+    int steps;
+    float f;      /* last sample */
+    double least_t; /* where the block's axes had the least f, and that f */
+    float least_f;
+} disti_cone;
+
+enum {
+    DISTI_CONE_FIRST = 32,
+    DISTI_CONE_LEAF = 4,
+    DISTI_CONE_RAYS = 4, /* fewer march by themselves */
+    DISTI_CONES_MOST = 4 + 16 + 64 + 256
+};
+
+enum { DISTI_CONE_THROUGH, DISTI_CONE_BLOCKED, DISTI_CONE_SPLIT, DISTI_CONE_MARCHES };
+
 /* One past the last pixel of a block that starts at `first`: the extra column goes with the last block. */
 static int disti_block_end(int first, int size, int own, int traced)
 {
     return first + size >= own ? traced : first + size;
 }
 
+/* Whether so few of the block's pixels are asked for that a cone for them is not worth it. */
+static int disti_cone_few(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench,
+                          const disti_cone *cone, int x1, int y1)
+{
+    int rays = 0;
+    for (int y = cone->y; tracer->how.pixels && y < y1; y++)
+        for (int x = cone->x; x < x1; x++) rays += bench->rays[y * tile->width + x].mode != DISTI_DONE;
+    return tracer->how.pixels && rays < DISTI_CONE_RAYS;
+}
+
+/* Axis, width and state of a cone of which x, y, size and t are set. Of all rays of the cone the one nearest to the
+   center of the bounding sphere, at the angle to it of the axis less the half angle, enters that first and leaves it
+   last; all others lie between. */
 static void disti_cone_init(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench,
                             disti_cone *cone)
 {
+    const disti_view *view = tile->view;
+    const dist_field *field = tracer->field;
     int x1 = disti_block_end(cone->x, cone->size, tile->own_width, tile->width) - 1;
     int y1 = disti_block_end(cone->y, cone->size, tile->own_height, tile->height) - 1;
-    double axis[3], corner[3], world[3], widest = 0.0;
-    disti_view_direction(tile->view, tile->x + 0.5 * (cone->x + x1), tile->y + 0.5 * (cone->y + y1), axis);
+    double axis[3], corner[3], world[3], o[3], widest = 0.0, radius = (double)field->radius;
+    disti_view_direction(view, tile->x + 0.5 * (cone->x + x1), tile->y + 0.5 * (cone->y + y1), axis);
     for (int i = 0; i < 4; i++) {
-        disti_view_direction(tile->view, tile->x + (i & 1 ? x1 : cone->x), tile->y + (i & 2 ? y1 : cone->y), corner);
+        disti_view_direction(view, tile->x + (i & 1 ? x1 : cone->x), tile->y + (i & 2 ? y1 : cone->y), corner);
         double d[3] = {corner[0] - axis[0], corner[1] - axis[1], corner[2] - axis[2]};
-        widest = DISTI_MAX(widest, sqrt(disti_dot(d, d)));
+        widest = DISTI_MAX(widest, disti_dot(d, d));
     }
-    cone->chord = widest;
-    cone->cosine = 1.0 - 0.5 * widest * widest; /* chord = 2 sin(angle / 2), so cos(angle) = 1 - chord^2 / 2 */
-    cone->sine = widest * sqrt(DISTI_MAX(0.0, 1.0 - 0.25 * widest * widest));
-    disti_rotate_back(tile->view->rotation, axis, world);
-    disti_ray_init(tracer->field, tile->view->center, world, 0.0, &cone->axis);
-    cone->enter = 1e300;
-    cone->leave = -1e300;
-    cone->rays = 0;
-    for (int y = cone->y; y <= y1; y++) {
-        for (int x = cone->x; x <= x1; x++) {
-            const disti_ray *ray = &bench->rays[y * tile->width + x];
-            if (ray->mode == DISTI_DONE) continue;
-            cone->rays++;
-            cone->enter = DISTI_MIN(cone->enter, ray->base + (double)ray->enter);
-            cone->leave = DISTI_MAX(cone->leave, ray->base + (double)ray->leave);
-        }
+    cone->chord = sqrt(widest);
+    cone->cosine = 1.0 - 0.5 * widest; /* chord = 2 sin(angle / 2), so cos(angle) = 1 - chord^2 / 2 */
+    cone->sine = sqrt(widest * DISTI_MAX(0.0, 1.0 - 0.25 * widest));
+    disti_rotate_back(view->rotation, axis, world);
+    for (int i = 0; i < 3; i++) o[i] = view->center[i] - (double)field->center[i];
+    double along = cone->base = -disti_dot(o, world);
+    for (int i = 0; i < 3; i++) {
+        o[i] += along * world[i];
+        cone->origin[i] = (float)(o[i] + (double)field->center[i]);
+        cone->direction[i] = (float)world[i];
     }
-    cone->t = DISTI_MAX(cone->t, cone->enter);
+    double off = sqrt(disti_dot(o, o)), near = off * cone->cosine - along * cone->sine;
+    double ahead = near > 0.0 ? along * cone->cosine + off * cone->sine : sqrt(along * along + off * off);
+    double half = near > 0.0 ? radius * radius - near * near : radius * radius;
+    half = half > 0.0 ? sqrt(half) : -ahead;
+    cone->t = DISTI_MAX(DISTI_MAX(cone->t, ahead - half), 0.0);
+    cone->leave = ahead + half;
+    cone->f = 3e38f; /* no sample */
+    cone->state = !(cone->t < cone->leave)                                   ? DISTI_CONE_THROUGH
+                  : disti_cone_few(tracer, tile, bench, cone, x1 + 1, y1 + 1) ? DISTI_CONE_BLOCKED
+                                                                             : DISTI_CONE_MARCHES;
 }
 
-/* One sample at the cone's axis. 1: it goes on; 0: it is blocked or through. */
+static void disti_cone_point(const disti_cone *cone, float p[3])
+{
+    float s = (float)(cone->t - cone->base);
+    for (int i = 0; i < 3; i++) p[i] = cone->origin[i] + s * cone->direction[i];
+}
+
+/* One sample at the cone's axis, and the state that follows from it. */
 static int disti_cone_advance(const disti_tracer *tracer, disti_cone *cone, float f)
 {
-    cone->blocked = 1;
     cone->f = f;
-    if (!disti_finite(f)) return 0;
+    if (!disti_finite(f) || ++cone->steps > 64) return DISTI_CONE_BLOCKED;
     if (f < cone->least_f) {
         cone->least_f = f;
         cone->least_t = cone->t;
@@ -8801,19 +8887,20 @@ static int disti_cone_advance(const disti_tracer *tracer, disti_cone *cone, floa
     float margin = tracer->epsilon > 0.0f ? tracer->epsilon : 5e-5f * tracer->field->radius;
     double radius = (double)disti_empty(tracer, f - margin);
     double wide = cone->t * cone->sine;
-    if (radius < 1.05 * cone->t * cone->chord || radius <= wide) return 0;
+    if (radius < 1.05 * cone->t * cone->chord || radius <= wide) return DISTI_CONE_BLOCKED;
     double t = cone->t * cone->cosine + sqrt(radius * radius - wide * wide);
-    if (t - cone->t < 1e-3 * (double)tracer->field->radius) return 0;
+    if (t - cone->t < 1e-3 * (double)tracer->field->radius) return DISTI_CONE_BLOCKED;
     cone->t = t;
-    cone->blocked = t < cone->leave;
-    return cone->blocked;
+    return t < cone->leave ? DISTI_CONE_MARCHES : DISTI_CONE_THROUGH;
 }
 
-/* What the cones leave: rays of a block that is through are misses; the others start at the block's stop, where f is
+/* What a cone leaves: rays of a block that is through are misses; the others start at the block's stop, where f is
    at most the axis's sample plus the Lipschitz figure times how far they are from the axis. */
 static void disti_cone_finish(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench,
                               const disti_cone *cone)
 {
+    int x1 = disti_block_end(cone->x, cone->size, tile->own_width, tile->width);
+    int y1 = disti_block_end(cone->y, cone->size, tile->own_height, tile->height);
     for (int y = cone->y; y < DISTI_MIN(cone->y + cone->size, tile->own_height); y += DISTI_LEAST_BLOCK) {
         for (int x = cone->x; x < DISTI_MIN(cone->x + cone->size, tile->own_width); x += DISTI_LEAST_BLOCK) {
             int block = y / DISTI_LEAST_BLOCK * DISTI_LEAST_ROW + x / DISTI_LEAST_BLOCK;
@@ -8822,101 +8909,80 @@ static void disti_cone_finish(const disti_tracer *tracer, const disti_tile *tile
             bench->least_of->t[block] = (float)cone->least_t;
         }
     }
-    for (int y = cone->y; y < disti_block_end(cone->y, cone->size, tile->own_height, tile->height); y++) {
-        for (int x = cone->x; x < disti_block_end(cone->x, cone->size, tile->own_width, tile->width); x++) {
+    if (tile->lazy && cone->state == DISTI_CONE_THROUGH) return;
+    if (tile->lazy) disti_tile_rays(tracer, tile, bench, cone->x, cone->y, x1, y1);
+    float axis[3], p[3];
+    disti_cone_point(cone, axis);
+    for (int y = cone->y; y < y1; y++) {
+        for (int x = cone->x; x < x1; x++) {
             disti_ray *ray = &bench->rays[y * tile->width + x];
             if (ray->mode == DISTI_DONE) continue;
-            if (!cone->blocked || cone->t >= ray->base + (double)ray->leave) {
+            if (cone->state == DISTI_CONE_THROUGH || cone->t >= ray->base + (double)ray->leave) {
                 ray->mode = DISTI_DONE;
                 ray->status = DIST_RAY_MISS;
                 continue;
             }
-            float p[3], axis[3];
             ray->start = ray->q = DISTI_MAX(ray->enter, (float)(cone->t - ray->base));
             disti_ray_point(ray, ray->start, p);
-            disti_ray_point(&cone->axis, (float)(cone->t - cone->axis.base), axis);
             float away = disti_length(p[0] - axis[0], p[1] - axis[1], p[2] - axis[2]);
             if (disti_finite(cone->f)) ray->guard = cone->f + tracer->lipschitz * away + 1e-3f * tracer->field->radius;
         }
     }
 }
 
-enum {
-    DISTI_CONE_FIRST = 32,
-    DISTI_CONE_LEAF = 4,
-    DISTI_CONE_RAYS = 4, /* fewer march by themselves */
-    DISTI_CONES_MOST = (DISTI_TILE / DISTI_CONE_LEAF) * (DISTI_TILE / DISTI_CONE_LEAF)
-};
-
-/* Marches one level's cones to their stops, all of them in packed rounds. */
-static void disti_cone_rounds(const disti_tracer *tracer, int worker, const disti_bench *bench, disti_cone *cones,
-                              int count)
+/* Adds a block's cone to those in bench->rest, and to the list where it marches. */
+static void disti_cone_add(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench, int x, int y,
+                           const disti_cone *parent, int *count, size_t *listed)
 {
-    size_t active = 0;
-    for (int i = 0; i < count; i++) {
-        cones[i].blocked = cones[i].enter <= cones[i].leave && cones[i].t < cones[i].leave;
-        cones[i].f = 3e38f; /* no sample */
-        if (cones[i].rays < DISTI_CONE_RAYS) cones[i].blocked = 1;
-        else if (cones[i].blocked) bench->index[active++] = i;
-    }
-    for (int round = 0; active > 0; round++) {
-        size_t kept = 0;
-        for (size_t i = 0; i < active; i++) {
-            const disti_cone *cone = &cones[bench->index[i]];
-            disti_ray_point(&cone->axis, (float)(cone->t - cone->axis.base), bench->points + 3 * i);
-        }
-        active = disti_query(tracer, worker, bench, active);
-        bench->stats->cone_queries += active;
-        for (size_t i = 0; i < active; i++)
-            if (disti_cone_advance(tracer, &cones[bench->index[i]], bench->sdf[i]) && round < 64)
-                bench->index[kept++] = bench->index[i];
-        active = kept;
-    }
+    disti_cone *cone = (disti_cone *)(void *)bench->rest + *count;
+    memset(cone, 0, sizeof *cone);
+    cone->x = x;
+    cone->y = y;
+    cone->size = parent ? parent->size / 2 : DISTI_CONE_FIRST;
+    cone->t = parent ? parent->t : 0.0;
+    cone->least_t = parent ? parent->least_t : 0.0;
+    cone->least_f = parent ? parent->least_f : 3e38f;
+    disti_cone_init(tracer, tile, bench, cone);
+    if (cone->state == DISTI_CONE_MARCHES) bench->index[(*listed)++] = *count;
+    (*count)++;
 }
 
-/* Blocks of 32, 16, 8 and so on to `leaf` pixels. The two cone lists stand in bench->rest. */
-static void disti_cones(const disti_tracer *tracer, int worker, const disti_tile *tile, const disti_bench *bench,
-                        int leaf)
+/* Blocks of 32, 16, 8 and so on to `leaf` pixels, all that are on their way in packed rounds. Returns how many blocks
+   are not seen to be empty. */
+static int disti_cones(const disti_tracer *tracer, int worker, const disti_tile *tile, const disti_bench *bench,
+                       int leaf)
 {
     disti_cone *cones = (disti_cone *)(void *)bench->rest;
-    disti_cone *next = cones + DISTI_CONES_MOST;
-    int count = 0;
-    memset(cones, 0, sizeof(disti_cone) * 4);
-    for (int y = 0; y < tile->own_height; y += DISTI_CONE_FIRST) {
-        for (int x = 0; x < tile->own_width; x += DISTI_CONE_FIRST) {
-            cones[count].x = x;
-            cones[count].y = y;
-            cones[count].least_f = 3e38f;
-            cones[count++].size = DISTI_CONE_FIRST;
-        }
-    }
-    for (int size = DISTI_CONE_FIRST;; size /= 2) {
-        int children = 0;
-        for (int i = 0; i < count; i++) disti_cone_init(tracer, tile, bench, &cones[i]);
-        disti_cone_rounds(tracer, worker, bench, cones, count);
-        for (int i = 0; i < count; i++) {
-            if (!cones[i].blocked || size == leaf) {
-                disti_cone_finish(tracer, tile, bench, &cones[i]);
-                continue;
-            }
+    size_t active = 0;
+    int count = 0, blocked = 0;
+    for (int y = 0; y < tile->own_height; y += DISTI_CONE_FIRST)
+        for (int x = 0; x < tile->own_width; x += DISTI_CONE_FIRST)
+            disti_cone_add(tracer, tile, bench, x, y, NULL, &count, &active);
+    while (active > 0) {
+        for (size_t i = 0; i < active; i++) disti_cone_point(&cones[bench->index[i]], bench->points + 3 * i);
+        size_t asked = disti_query(tracer, worker, bench, active), all = active, kept = 0;
+        bench->stats->cone_queries += asked;
+        for (size_t i = 0; i < active; i++) { /* children go behind all others in the list */
+            disti_cone *cone = &cones[bench->index[i]];
+            cone->state = i < asked ? disti_cone_advance(tracer, cone, bench->sdf[i]) : DISTI_CONE_BLOCKED;
+            if (cone->state == DISTI_CONE_MARCHES) bench->index[kept++] = bench->index[i];
+            if (cone->state != DISTI_CONE_BLOCKED || i >= asked || cone->size == leaf) continue;
+            cone->state = DISTI_CONE_SPLIT;
             for (int k = 0; k < 4; k++) {
-                disti_cone *child = &next[children];
-                memset(child, 0, sizeof *child);
-                child->size = size / 2;
-                child->x = cones[i].x + (k & 1 ? child->size : 0);
-                child->y = cones[i].y + (k & 2 ? child->size : 0);
-                child->t = cones[i].t;
-                child->least_t = cones[i].least_t;
-                child->least_f = cones[i].least_f;
-                children += child->x < tile->own_width && child->y < tile->own_height;
+                int x = cone->x + (k & 1 ? cone->size / 2 : 0), y = cone->y + (k & 2 ? cone->size / 2 : 0);
+                if (x < tile->own_width && y < tile->own_height)
+                    disti_cone_add(tracer, tile, bench, x, y, cone, &count, &all);
             }
         }
-        if (size == leaf || children == 0) return;
-        disti_cone *swap = cones;
-        cones = next;
-        next = swap;
-        count = children;
+        memmove(bench->index + kept, bench->index + active, (all - active) * sizeof(int));
+        active = kept + all - active;
     }
+    for (int i = 0; i < count; i++) blocked += cones[i].state == DISTI_CONE_BLOCKED;
+    if (tile->lazy && blocked == 0) return 0;
+    for (int i = 0; tile->lazy && i < tile->width * tile->height; i++) disti_ray_close(&bench->rays[i]);
+    for (int i = 0; i < count; i++)
+        if (cones[i].state != DISTI_CONE_SPLIT) disti_cone_finish(tracer, tile, bench, &cones[i]);
+    return blocked;
 }
 
 /* Prediction between neighbors: every 8th pixel is marched, then the pixels half way between known ones, three times
@@ -9620,13 +9686,6 @@ DIST_API dist_tape *dist_tape_create(dist_context *ctx, const dist_camera *camer
     return tape;
 }
 
-/* Half a pixel's width at unit distance: cos^2 / (2 f), with the larger of the focal lengths. */
-static double disti_view_footprint(const disti_view *view, double cosine)
-{
-    double f = DISTI_MAX(fabs(view->fx), fabs(view->fy));
-    return 0.5 * cosine * cosine / f;
-}
-
 /* Ray of pixel (x, y), unit direction in camera space in `local`. */
 static void disti_pixel_ray(const disti_view *view, const dist_field *field, int x, int y, double local[3],
                             disti_ray *ray)
@@ -9649,6 +9708,7 @@ typedef struct disti_render_job {
     int predict; /* pixels start from what their neighbors found */
     int least;   /* misses need their smallest f: for the silhouette or the relaxed boundary */
     int warm;    /* and from what the tape's picture found */
+    int lazy;    /* nothing is wanted of rays that miss */
     float step;  /* three pixels' width at the field's center */
     float change; /* mean change of f at the tape's hits */
     size_t first[DISTI_LIST_TASKS + 1]; /* disti_render_list: first pixel of each task */
@@ -9871,6 +9931,14 @@ static void disti_render_nothing(const disti_render_job *job, size_t pixel, size
         memcpy(out->color + 3 * (pixel + i), job->tracer->how.background_color, 3 * sizeof(float));
 }
 
+/* A tile of which the cones leave nothing. */
+static void disti_render_empty(const disti_render_job *job, const disti_tile *tile, const disti_bench *bench)
+{
+    for (int y = 0; y < tile->own_height; y++)
+        disti_render_nothing(job, disti_tile_pixel(tile, y * tile->width), (size_t)tile->own_width);
+    bench->stats->rays += (unsigned long long)tile->own_width * (unsigned long long)tile->own_height;
+}
+
 static void disti_render_planes(const disti_render_job *job, const disti_tile *tile, const disti_bench *bench)
 {
     int plain = !job->out->silhouette && !job->tape && !tile->list;
@@ -9890,42 +9958,34 @@ static void disti_render_planes(const disti_render_job *job, const disti_tile *t
     }
 }
 
-/* A pixel that nobody asked for. */
-static void disti_ray_skip(disti_ray *ray)
+/* Adds the pixels whose rays meet the bounding sphere: with b = c . d and k = |c|^2 - radius^2 those with b < 0 and
+   b^2 > k |d|^2, or all from within it; c: the camera, from the center; d = (u, v, 1), rotated to the world. */
+DISTI_LOOPS static unsigned disti_row_meets(int n, double first, double scale, double b0, double b1, double w, double k)
 {
-    memset(ray, 0, sizeof *ray);
-    ray->fbest = 3e38f;
-    ray->status = DIST_RAY_SKIPPED; /* mode is DISTI_DONE, and the sphere is not met: enter = leave */
+    unsigned count = 0;
+    for (int i = 0; i < n; i++) {
+        double u = (first + (double)i) * scale, b = b0 + b1 * u;
+        count += (b < 0.0) & (b * b > k * (u * u + w));
+    }
+    return count;
 }
 
-/* The rays of a tile, as disti_pixel_ray makes them. Off the box around the bounding sphere they miss; what else is to
-   be known of them is left out unless something is kept of misses. */
-static void disti_render_rays(const disti_render_job *job, const disti_tile *tile, disti_ray *ray)
+static void disti_render_meets(const disti_render_job *job, const disti_tile *tile, dist_stats *stats)
 {
     const disti_view *view = job->view;
     const dist_field *field = job->tracer->field;
-    const double *m = view->rotation;
-    const unsigned char *pixels = job->tracer->how.pixels;
-    double c[3], per_pixel = disti_view_footprint(view, 1.0);
-    int all = job->least || job->tape || job->tracer->how.trace == DIST_TRACE_PAPER;
-    memset(ray, 0, (size_t)(tile->width * tile->height) * sizeof *ray);
+    double c[3], local[3];
+    int low = DISTI_MAX(tile->x, job->box[0]), high = DISTI_MIN(tile->x + tile->own_width, job->box[2]);
+    int top = DISTI_MAX(tile->y, job->box[1]), bottom = DISTI_MIN(tile->y + tile->own_height, job->box[3]);
     for (int i = 0; i < 3; i++) c[i] = view->center[i] - (double)field->center[i];
-    for (int y = tile->y; y < tile->y + tile->height; y++) {
-        int out = !all && (y < job->box[1] || y >= job->box[3]);
-        double v = ((double)y + view->first - view->cy) / view->fy, skewed = view->cx + view->skew * v - view->first;
-        double row[3] = {m[3] * v + m[6], m[4] * v + m[7], m[5] * v + m[8]};
-        for (int x = tile->x; x < tile->x + tile->width; x++, ray++) {
-            if (pixels && !pixels[(size_t)y * (size_t)view->width + (size_t)x]) {
-                disti_ray_skip(ray);
-            } else if (out || (!all && (x < job->box[0] || x >= job->box[2]))) {
-                ray->fbest = 3e38f;
-            } else {
-                double u = ((double)x - skewed) / view->fx, cosine = 1.0 / sqrt(u * u + v * v + 1.0);
-                disti_ray_place(field, c[0], c[1], c[2], (m[0] * u + row[0]) * cosine, (m[1] * u + row[1]) * cosine,
-                                (m[2] * u + row[2]) * cosine, per_pixel * cosine * cosine, ray);
-                ray->cosine = (float)cosine;
-            }
-        }
+    disti_rotate(view->rotation, c, local);
+    double k = disti_dot(c, c) - (double)field->radius * (double)field->radius;
+    for (int y = top; y < bottom && low < high; y++) {
+        double v = ((double)y + view->first - view->cy) / view->fy;
+        if (k <= 0.0) stats->rays_in_sphere += (unsigned)(high - low);
+        else stats->rays_in_sphere += disti_row_meets(high - low, (double)low + view->first - view->cx - view->skew * v,
+                                                      1.0 / view->fx, local[1] * v + local[2], local[0], v * v + 1.0,
+                                                      k);
     }
 }
 
@@ -10508,8 +10568,10 @@ static void disti_render_task(void *arg, int index, int worker)
     int predict = job->predict && !job->warm;
     if (predict && tile.x + tile.width < job->view->width) tile.width++;
     if (predict && tile.y + tile.height < job->view->height) tile.height++;
-    int n = tile.width * tile.height;
-    disti_render_rays(job, &tile, bench.rays);
+    int n = tile.width * tile.height, open = 1;
+    unsigned long long met = bench.stats->rays_in_sphere;
+    tile.lazy = job->lazy;
+    if (!tile.lazy) disti_tile_rays(tracer, &tile, &bench, 0, 0, tile.width, tile.height);
 #ifndef DIST_NO_PAPER
     if (tracer->how.trace == DIST_TRACE_PAPER) {
         size_t first = (size_t)tile.y * (size_t)job->view->width + (size_t)tile.x;
@@ -10522,7 +10584,14 @@ static void disti_render_task(void *arg, int index, int worker)
         budget.left -= kept;
         for (int i = 0; i < DISTI_LEASTS; i++) bench.least_of->f[i] = 3e38f;
         if (!tracer->how.no_cones)
-            disti_cones(tracer, worker, &tile, &bench, job->predict ? (int)DISTI_LATTICE : (int)DISTI_CONE_LEAF);
+            open = disti_cones(tracer, worker, &tile, &bench,
+                               job->predict ? (int)DISTI_LATTICE : (int)DISTI_CONE_LEAF);
+        if (tile.lazy && job->out->stats) disti_render_meets(job, &tile, bench.stats);
+        met = bench.stats->rays_in_sphere;
+        if (tile.lazy && !open) {
+            disti_render_empty(job, &tile, &bench);
+            return;
+        }
         budget.marching = 1;
         for (int i = 0; i < n && job->tape; i++) bench.rays[i].stop = bench.rays[i].start;
         if (job->warm) disti_render_warm(job, worker, &tile, &bench);
@@ -10538,6 +10607,7 @@ static void disti_render_task(void *arg, int index, int worker)
         else if (job->tape && job->tape->value) disti_warm_seed(&tile, &bench);
     }
     disti_render_planes(job, &tile, &bench);
+    if (tile.lazy) bench.stats->rays_in_sphere = met; /* planes counts only those that were made */
     if (job->out->normal) disti_render_normals(job, worker, &tile, &bench);
     if (job->out->color) disti_render_colors(job, worker, &tile, &bench);
 }
@@ -10683,6 +10753,8 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     job.across = (view.width + job.tile - 1) / job.tile;
     job.predict = disti_render_predicts(&tracer, &view);
     job.least = out->silhouette || (tape && tracer.how.relax_band > 0.0f);
+    job.lazy = !job.least && !tape && !tracer.how.pixels && !tracer.how.no_cones &&
+               tracer.how.trace == DIST_TRACE_GUARDED;
     int listed = disti_render_list(&tracer, &view, &job);
     job.count = listed ? listed : job.across * ((view.height + job.tile - 1) / job.tile);
     disti_sphere_box(&view, field, job.box);

@@ -91,7 +91,8 @@ enum {
 DIST_API const char *dist_version(void);
 
 /* Memory. alloc_fn returns `bytes` bytes aligned to `alignment` (a power of two, at most 64) or NULL; free_fn gets the
-   same pointer and size back, never NULL. Called only inside create, load and extract functions and destroy.
+   same pointer and size back, never NULL. Called only inside create, load and extract functions and destroy; like
+   every hook, it may use this library with other contexts than the one that calls it.
    Either both functions or none; none: malloc and free. */
 typedef struct dist_allocator {
     void *user;
@@ -423,7 +424,8 @@ DIST_API dist_status dist_shape_eval(dist_context *ctx, dist_shape *shape, size_
    pixel u = fx X/Z + skew Y/Z + cx, v = fy Y/Z + cy. */
 typedef struct dist_camera {
     float fx, fy, cx, cy, skew; /* pixels */
-    float rotation[9];
+    float rotation[9]; /* rows off orthonormal by up to 1e-3 are made exact, more is refused: dist_camera_move by 0
+                          projects */
     float translation[3];
     int width, height;  /* 1 to 65536 */
     float pixel_center; /* coordinate of the first pixel's center: 0 (OpenCV, the authors) or 0.5 (COLMAP, OpenGL) */
@@ -513,7 +515,7 @@ typedef struct dist_stats {
     unsigned long long cone_queries, march_queries, refine_queries, silhouette_queries,
         normal_queries, color_queries; /* their parts */
     unsigned long long hits, unresolved, inside, plateau, not_finite;
-    unsigned long long capped;          /* backward: rays whose grad f . v was capped */
+    unsigned long long capped;          /* backward: rays whose grad f . v was capped, or grad f 0: then without pull */
     unsigned long long backward_points; /* backward: points through the adjoint */
     unsigned long long skipped;         /* backward: pixels with a zero upstream gradient */
     double operations; /* multiply-adds a dense net would have done for the queries; 0 if the field is not a net */
@@ -9497,6 +9499,11 @@ static void disti_paper_finish(const disti_tracer *tracer, disti_ray *ray)
     else if (before && ray->fa <= epsilon && first) ray->status = DIST_RAY_HIT;
     else if (before && !first && ray->a < 0.0f) ray->status = DIST_RAY_INSIDE;
     else if (before) ray->status = DIST_RAY_UNRESOLVED;
+    int behind = ray->status == DIST_RAY_HIT && ray->base + (double)ray->best < 0.0; /* f < 0 at first: it went back */
+    if (behind || ray->status == DIST_RAY_INSIDE) {
+        disti_ray_end(ray, DIST_RAY_INSIDE, ray->enter, ray->a, 0.0f);
+        return;
+    }
     ray->error = before && ray->status == DIST_RAY_UNRESOLVED
                      ? DISTI_MAX(ray->leave - ray->best, ray->best - ray->enter) /* steps may have gone too far */
                      : magnitude;
@@ -10836,6 +10843,7 @@ static void disti_render_seed(void *user, size_t first, size_t count, const floa
         entry->weight = 1.0f;
         if (entry->d_distance == 0.0f && !entry->capped) continue;
         if (entry->capped || !(length > 1e-30f)) {
+            entry->capped = 1;
             entry->weight = 0.0f;
             continue;
         }

@@ -28,6 +28,7 @@ typedef struct test_shape {
     double power;                /* f -> f^3 where it is 3, sign(f) where it is -1; 0: not */
     double poison;               /* NaN within this distance of (0, 0, 0.5); 0: nowhere */
     long queries, gradients;     /* points asked for, and of them those with a gradient */
+    long clamped;                /* of those, where f is clamped */
     float *notes;                /* (SHAPE_NOTES, 4): point and value of each query; NULL: none */
 } test_shape;
 
@@ -126,6 +127,7 @@ TEST_UNUSED static void shape_eval(void *user, int worker, size_t n, const float
         if (shape->notes || worker == 0) shape->queries++;
         if (!gradient) continue;
         if (worker == 0) shape->gradients++;
+        if (worker == 0) shape->clamped += shape->clamp > 0 && fabs(shape_value(shape, p)) >= shape->clamp;
         for (size_t k = 0; k < 3; k++) {
             double a[3] = {p[0], p[1], p[2]}, b[3] = {p[0], p[1], p[2]}, h = 1e-6 * (1 + fabs(p[k]));
             a[k] += h;

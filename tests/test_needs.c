@@ -1,8 +1,10 @@
 /* SPDX-License-Identifier: MIT-0
-   What a scene does not need it does not pay for: the rows of bench/bench_needs.c, by their counts. */
+   What a scene does not need it does not pay for: the rows of bench/bench_needs.c, by their counts; and the reference
+   in double that bench_work_precision measures against. */
 #include "test.h"
 #include "../examples/common.h"
 #include "../bench/bench.h"
+#include "../bench/exact.h"
 #include "../bench/needs.h"
 
 enum { SIZE = 96 };
@@ -83,6 +85,64 @@ TEST(memory_is_the_tracers_and_the_nets_and_a_tape_only_where_one_is_wanted)
     CHECK(results[NEED_TEN].bytes - none < 500000);
 }
 
+/* The benches' reference in double, against dist_field_eval (file NULL) or NAME.ref.f64 of the test data. */
+static void check_exact(const char *model, int code, const char *file)
+{
+    enum { ROWS = 256 };
+    static double points[3 * ROWS], f[ROWS], gradient[3 * ROWS], worst[3];
+    size_t bytes = 0;
+    dist_context *ctx = dist_context_create(NULL);
+    double *reference = file ? (double *)test_file_read(test_data_path(file), &bytes) : NULL;
+    dist_net *net = file ? (reference ? load_net_or_skip(ctx, model) : NULL) : load_model(ctx, model);
+    if (!net) {
+        dist_context_destroy(ctx);
+        SKIP("the real decoders are not here");
+    }
+    int n = dist_net_code_size(net), row = 7 + n;
+    size_t rows = reference ? bytes / sizeof(double) / (size_t)row : ROWS;
+    exact e = exact_create(net, dist_net_code(net, code));
+    CHECK_EQUAL(ROWS, rows);
+    for (size_t i = 0; i < ROWS; i++)
+        for (size_t a = 0; a < 3; a++)
+            points[3 * i + a] = reference ? reference[i * (size_t)row + a] : 0.1 * (double)((i * (7 + 4 * a)) % 13) - 0.6;
+    exact_eval(&e, ROWS, points, f, gradient, NULL);
+    if (!reference) {
+        float at[3 * ROWS], sdf[ROWS];
+        dist_shape *shape = dist_shape_create(ctx, net, dist_net_code(net, code));
+        dist_field field = dist_shape_field(shape);
+        for (size_t i = 0; i < 3 * ROWS; i++) at[i] = (float)points[i];
+        CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &field, ROWS, at, sdf, NULL), ctx);
+        for (size_t i = 0; i < ROWS; i++) CHECK_NEAR(f[i], (double)sdf[i], 2e-6);
+        dist_shape_destroy(shape);
+    }
+    memset(worst, 0, sizeof worst);
+    for (size_t i = 0; i < ROWS && reference; i++) {
+        const double *r = reference + i * (size_t)row, one = 1;
+        double *d_code = (double *)calloc((size_t)n + 1, sizeof *d_code), again, slope[3];
+        exact_forget(&e);
+        exact_eval(&e, 1, points + 3 * i, &again, slope, &one);
+        exact_code(&e, d_code);
+        worst[0] = fmax(worst[0], fabs(f[i] - r[3]));
+        for (int a = 0; a < 3; a++) worst[1] = fmax(worst[1], fabs(gradient[3 * i + (size_t)a] - r[4 + a]));
+        for (int j = 0; j < n; j++) worst[2] = fmax(worst[2], fabs(d_code[j] - r[7 + j]));
+        free(d_code);
+    }
+    for (int k = 0; k < 3; k++) CHECK_NEAR(0, worst[k], 1e-6); /* weight norm is folded in single precision */
+    if (test_state.verbose) printf("    %s: %.1e %.1e %.1e\n", model, worst[0], worst[1], worst[2]);
+    exact_destroy(&e);
+    free(reference);
+    dist_net_destroy(net);
+    dist_context_destroy(ctx);
+}
+
+TEST(exact_of_the_embedded_model) { check_exact("embedded", 5, NULL); }
+TEST(exact_of_bob_spot) { check_exact("bob_spot", 1, "nets/bob_spot.1.ref.f64"); }
+TEST(exact_of_chairs) { check_exact("chairs", 3, "nets/chairs.3.ref.f64"); }
+TEST(exact_of_two_spheres_sine) { check_exact("two_spheres_sine", 0, "nets/two_spheres_sine.ref.f64"); }
+TEST(exact_of_round_cross) { check_exact("round_cross", 10, "nets/round_cross.10.ref.f64"); }
+TEST(exact_of_mug) { check_exact("mug_camera_bottle", 0, "nets/mug_camera_bottle.0.ref.f64"); }
+TEST(exact_of_fox) { check_exact("fox", 0, "nets/fox.ref.f64"); }
+
 int main(int argc, char **argv)
 {
     test_begin(argc, argv);
@@ -93,5 +153,12 @@ int main(int argc, char **argv)
     RUN(a_static_camera_costs_about_two_queries_a_hit);
     RUN(instances_out_of_view_cost_nothing);
     RUN(memory_is_the_tracers_and_the_nets_and_a_tape_only_where_one_is_wanted);
+    RUN(exact_of_the_embedded_model);
+    RUN(exact_of_bob_spot);
+    RUN(exact_of_chairs);
+    RUN(exact_of_two_spheres_sine);
+    RUN(exact_of_round_cross);
+    RUN(exact_of_mug);
+    RUN(exact_of_fox);
     return test_report();
 }

@@ -5,6 +5,7 @@
 #define DIST_IMPLEMENTATION
 #include "../dist.h"
 #include "../examples/common.h"
+#include "../examples/fit.h"
 #include "bench.h"
 
 static const char usage[] =
@@ -59,75 +60,26 @@ static const char *trace_name(const fit_mode *mode)
     return mode->trace == DIST_TRACE_PAPER ? "paper" : "guarded";
 }
 
-static const char *gradient_name(const fit_mode *mode)
-{
-    static const char *const names[] = {"auto", "implicit", "normal", "paper"};
-    return names[mode->gradient];
-}
-
 typedef struct settings {
     const char *only_case, *only_mode;
     int iterations, size, slow, quick;
     float rate;
 } settings;
 
+/* What is rendered, and what is kept for its gradient. */
 typedef struct planes {
-    size_t n;
     float *depth, *silhouette, *d_depth, *d_silhouette;
     unsigned char *mask;
 } planes;
 
-static planes planes_create(size_t n)
-{
-    planes p;
-    p.n = n;
-    p.depth = take_floats(n);
-    p.silhouette = take_floats(n);
-    p.d_depth = take_floats(n);
-    p.d_silhouette = take_floats(n);
-    p.mask = (unsigned char *)take(n, 1);
-    return p;
-}
-
-static void planes_destroy(planes *p)
-{
-    free(p->depth);
-    free(p->silhouette);
-    free(p->d_depth);
-    free(p->d_silhouette);
-    free(p->mask);
-}
-
-/* Mean depth difference where both hit (-1: nowhere) and the overlap of the masks. */
-typedef struct score {
-    double depth_error, iou;
-} score;
-
-static score compare(const planes *target, const planes *p)
-{
-    double sum = 0;
-    double both = 0;
-    double either = 0;
-    for (size_t i = 0; i < p->n; i++) {
-        int common = target->mask[i] && p->mask[i];
-        both += common;
-        either += target->mask[i] || p->mask[i];
-        if (common) { sum += fabs((double)p->depth[i] - (double)target->depth[i]); }
-    }
-    score s;
-    s.depth_error = both > 0 ? sum / both : -1;
-    s.iou = either > 0 ? both / either : 0;
-    return s;
-}
-
 /* Every result is judged by the same tracer, whichever has fitted it. */
 static void render_reference(dist_context *ctx, dist_shape *shape, const float *code, const dist_camera *camera,
-                             planes *p)
+                             float *depth, unsigned char *mask)
 {
     dist_images out;
     memset(&out, 0, sizeof out);
-    out.depth = p->depth;
-    out.mask = p->mask;
+    out.depth = depth;
+    out.mask = mask;
     dist_shape_set_code(shape, code);
     dist_field field = dist_shape_field(shape);
     dist_render(ctx, &field, camera, NULL, &out, NULL);
@@ -136,7 +88,8 @@ static void render_reference(dist_context *ctx, dist_shape *shape, const float *
 
 /* Moves the code; returns the seconds. */
 static double fit_run(dist_context *ctx, const settings *s, const fit_mode *mode, dist_shape *shape, size_t code_size,
-                      float *code, const dist_camera *camera, const planes *target, planes *p, dist_stats *total)
+                      float *code, const dist_camera *camera, const observation *target, planes *p,
+                      dist_stats *total)
 {
     dist_render_desc how;
     memset(&how, 0, sizeof how);
@@ -164,13 +117,13 @@ static double fit_run(dist_context *ctx, const settings *s, const fit_mode *mode
     for (int i = 0; i < s->iterations; i++) {
         memset(&stats, 0, sizeof stats);
         memset(grads.code, 0, code_size * sizeof(float));
-        memset(p->d_depth, 0, p->n * sizeof(float));
-        memset(p->d_silhouette, 0, p->n * sizeof(float));
+        memset(p->d_depth, 0, target->n * sizeof(float));
+        memset(p->d_silhouette, 0, target->n * sizeof(float));
         dist_shape_set_code(shape, code);
         dist_field field = dist_shape_field(shape);
         dist_render(ctx, &field, camera, &how, &out, tape);
-        dist_loss_depth(p->n, p->depth, target->depth, p->mask, 10.0f, p->d_depth);
-        dist_loss_silhouette(p->n, p->silhouette, target->mask, 1.0f, p->d_silhouette);
+        dist_loss_depth(target->n, p->depth, target->depth, p->mask, 10.0f, p->d_depth);
+        dist_loss_silhouette(target->n, p->silhouette, target->mask, 1.0f, p->d_silhouette);
         dist_loss_code(code_size, code, 1.0f / (float)code_size, grads.code);
         dist_render_backward(ctx, tape, &d_out, &grads);
         check(ctx);
@@ -194,29 +147,33 @@ static void fit_one(dist_context *ctx, const settings *s, const fit_case *c, con
 {
     view v = view_default(s->size, s->size);
     dist_camera camera = view_camera(&v, 0.0f);
-    size_t n = (size_t)s->size * (size_t)s->size;
     size_t code_size = (size_t)dist_net_code_size(net);
     float *goal = choose_code(net, c->target);
     float *begin = choose_code(net, c->start);
     float *code = take_floats(code_size);
-    planes target = planes_create(n);
-    planes p = planes_create(n);
+    observation target = observation_create(s->size, s->size);
+    planes p;
+    p.depth = take_floats(4 * target.n);
+    p.silhouette = p.depth + target.n;
+    p.d_depth = p.silhouette + target.n;
+    p.d_silhouette = p.d_depth + target.n;
+    p.mask = (unsigned char *)take(target.n, 1);
     dist_shape *shape = dist_shape_create(ctx, net, goal);
     check(ctx);
-    render_reference(ctx, shape, goal, &camera, &target);
-    render_reference(ctx, shape, begin, &camera, &p);
-    score before = compare(&target, &p);
+    render_reference(ctx, shape, goal, &camera, target.depth, target.mask);
+    render_reference(ctx, shape, begin, &camera, p.depth, p.mask);
+    score before = score_pictures(&target, p.depth, p.mask);
     for (int m = 0; m < MODES; m++) {
         const fit_mode *mode = &modes[m];
         if (s->only_mode && strcmp(s->only_mode, mode->name) != 0) { continue; }
         dist_stats total;
         memcpy(code, begin, code_size * sizeof(float));
         double seconds = fit_run(ctx, s, mode, shape, code_size, code, &camera, &target, &p, &total);
-        render_reference(ctx, shape, code, &camera, &p);
-        score after = compare(&target, &p);
+        render_reference(ctx, shape, code, &camera, p.depth, p.mask);
+        score after = score_pictures(&target, p.depth, p.mask);
         double ratio = after.depth_error / before.depth_error;
         printf("%s,%s,%s,%d,%.6f,%.6f,%.4f,%.4f,%.4f,%llu,%.2f\n", c->name,
-               trace_name(mode), gradient_name(mode), mode->samples, before.depth_error, after.depth_error, ratio,
+               trace_name(mode), gradient_name(mode->gradient), mode->samples, before.depth_error, after.depth_error, ratio,
                before.iou, after.iou, total.queries, seconds);
         fflush(stdout);
         if (!(before.depth_error > 0 && after.depth_error > 0)) { continue; }
@@ -228,8 +185,9 @@ static void fit_one(dist_context *ctx, const settings *s, const fit_case *c, con
         tallies[m].seconds += seconds;
     }
     dist_shape_destroy(shape);
-    planes_destroy(&target);
-    planes_destroy(&p);
+    observation_destroy(&target);
+    free(p.depth);
+    free(p.mask);
     free(goal);
     free(begin);
     free(code);
@@ -243,7 +201,7 @@ static void print_tallies(const tally *tallies)
         if (t->count == 0) { continue; }
         double k = t->count;
         printf("all_%d,%s,%s,%d,,,%.4f,%.4f,%.4f,%.0f,%.2f\n", t->count,
-               trace_name(&modes[m]), gradient_name(&modes[m]), modes[m].samples, exp(t->log_ratio / k),
+               trace_name(&modes[m]), gradient_name(modes[m].gradient), modes[m].samples, exp(t->log_ratio / k),
                t->iou_start / k, t->iou_end / k, t->queries, t->seconds);
     }
 }

@@ -211,19 +211,11 @@ int main(int argc, char **argv)
     if (!results_wanted(&r, "pose")) { fail("--only takes pose"); }
     int levels = r.quick ? 2 : 6;
     int trials = r.quick ? 2 : 8;
-    request base;
-    memset(&base, 0, sizeof base);
-    base.fit = fit_defaults();
-    base.fit.how.gradient = DIST_GRADIENT_IMPLICIT;
-    base.fit.how.samples = 1;
-    base.fit.iterations = r.quick ? 20 : 80;
-    base.fit.rate = 0.03f;
-    base.fit.weights[1] = 100.0f;
-    base.fit.weights[2] = 0.0f;
+    request base = request_defaults();
+    if (r.quick) { base.fit.iterations = 20; }
     base.fit.view.width = base.fit.view.height = r.quick ? 32 : 64;
     base.fit.settings.workers = 1;
-    base.refine = 10;
-    base.restarts = r.quick ? 1 : 5;
+    if (r.quick) { base.restarts = 1; }
     dist_context *ctx = dist_context_create(NULL);
     dist_net *net = load_model(ctx, "embedded");
     job *jobs = (job *)take((size_t)(levels * trials), sizeof *jobs);

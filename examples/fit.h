@@ -197,11 +197,18 @@ static inline int is_depth(float depth)
     return depth > 0.0f && depth < 1e5f;
 }
 
-static inline observation observe_files(dist_context *ctx, const char *depth_path, const char *mask_path)
+/* --depth and --mask. The view gets their size. */
+static inline observation observe_files(dist_context *ctx, fit_options *o)
 {
+    const char *depth_path = o->depth_path, *mask_path = o->mask_path;
     int width = 0;
     int height = 0;
     float *depth = load_plane(ctx, depth_path, &width, &height);
+    if (o->view.width && (width != o->view.width || height != o->view.height)) {
+        fail("--size is %d x %d, but %s is %d x %d", o->view.width, o->view.height, depth_path, width, height);
+    }
+    o->view.width = width;
+    o->view.height = height;
     observation s = observation_create(width, height);
     for (size_t i = 0; i < s.n; i++) {
         s.mask[i] = is_depth(depth[i]) ? 1 : 0;

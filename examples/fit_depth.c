@@ -398,13 +398,7 @@ static observation observe(dist_context *ctx, const dist_net *net, request *r, d
     dist_mesh *mesh = NULL;
     *points = NULL;
     if (o->depth_path) {
-        seen = observe_files(ctx, o->depth_path, o->mask_path);
-        if (o->view.width && (seen.width != o->view.width || seen.height != o->view.height)) {
-            fail("--size is %d x %d, but %s is %d x %d", o->view.width, o->view.height, o->depth_path, seen.width,
-                 seen.height);
-        }
-        o->view.width = seen.width;
-        o->view.height = seen.height;
+        seen = observe_files(ctx, o);
         *camera = view_camera(&o->view, 0.0f);
         return seen;
     }

@@ -623,13 +623,7 @@ static observation observe(dist_context *ctx, const dist_net *net, request *r, c
     fit_options *o = &r->fit;
     observation seen;
     if (o->depth_path) {
-        seen = observe_files(ctx, o->depth_path, o->mask_path);
-        if (o->view.width && (seen.width != o->view.width || seen.height != o->view.height)) {
-            fail("--size is %d x %d, but %s is %d x %d", o->view.width, o->view.height, o->depth_path, seen.width,
-                 seen.height);
-        }
-        o->view.width = seen.width;
-        o->view.height = seen.height;
+        seen = observe_files(ctx, o);
         *camera = view_camera(&o->view, 0.0f);
     } else {
         *camera = view_camera(&o->view, 0.0f);
@@ -683,21 +677,27 @@ static void run_one(dist_context *ctx, const dist_net *net, request *r)
 
 /* ---- options ----------------------------------------------------------------------------------------------------- */
 
-static request read_options(int argc, char **argv)
+static request request_defaults(void)
 {
     request r;
     memset(&r, 0, sizeof r);
-    fit_options *o = &r.fit;
-    *o = fit_defaults();
-    o->how.gradient = DIST_GRADIENT_IMPLICIT;
-    o->how.samples = 1;
-    o->iterations = 80;
-    o->rate = 0.03f;
-    o->weights[1] = 100.0f;
-    o->weights[2] = 0.0f;
+    r.fit = fit_defaults();
+    r.fit.how.gradient = DIST_GRADIENT_IMPLICIT;
+    r.fit.how.samples = 1;
+    r.fit.iterations = 80;
+    r.fit.rate = 0.03f;
+    r.fit.weights[1] = 100.0f; /* of dist_loss_silhouette's mean over all pixels */
+    r.fit.weights[2] = 0.0f;
     r.off[0] = r.off[1] = -1.0f;
     r.refine = 10;
     r.restarts = 5;
+    return r;
+}
+
+static request read_options(int argc, char **argv)
+{
+    request r = request_defaults();
+    fit_options *o = &r.fit;
     options walk = options_begin(argc, argv, usage);
     while (option_next(&walk)) {
         if (option_is(&walk, "--off")) {

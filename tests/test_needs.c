@@ -104,7 +104,7 @@ static void check_exact(const char *model, int code, const char *file)
     CHECK_EQUAL(ROWS, rows);
     for (size_t i = 0; i < ROWS; i++)
         for (size_t a = 0; a < 3; a++)
-            points[3 * i + a] = reference ? reference[i * (size_t)row + a] : 0.1 * (double)((i * (7 + 4 * a)) % 13) - 0.6;
+            points[3 * i + a] = reference ? reference[i * (size_t)row + a] : 0.1 * (double)(i * (7 + 4 * a) % 13) - 0.6;
     exact_eval(&e, ROWS, points, f, gradient, NULL);
     if (!reference) {
         float at[3 * ROWS], sdf[ROWS];

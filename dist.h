@@ -9188,6 +9188,11 @@ static int disti_wants_minimum(const disti_ray *ray)
     return ray->status == DIST_RAY_MISS && ray->enter < ray->leave && !ray->kept;
 }
 
+static int disti_has_minimum(const disti_ray *ray)
+{
+    return ray->status == DIST_RAY_MISS && ray->enter < ray->leave && ray->fbest < 2e38f;
+}
+
 static void disti_keep_least(disti_ray *ray, float s, float f)
 {
     float a = f < 0.0f ? -f : f, b = ray->fbest < 0.0f ? -ray->fbest : ray->fbest;
@@ -9285,7 +9290,7 @@ static int disti_silhouette_between(const disti_tracer *tracer, const disti_tile
     for (int k = 0; k < 4; k++) {
         corner[k] = &bench->rays[(k & 2 ? y1 : y0) * tile->width + (k & 1 ? x1 : x0)];
         weight[k] = (k & 1 ? u : 1.0f - u) * (k & 2 ? v : 1.0f - v) + 1e-3f;
-        if (!disti_wants_minimum(corner[k]) || corner[k]->fbest > 2e38f) corner[k] = NULL;
+        if (!disti_has_minimum(corner[k])) corner[k] = NULL;
         else if (!least || corner[k]->fbest < least->fbest) least = corner[k];
     }
     *t = *f = 0.0f;
@@ -9360,7 +9365,7 @@ static void disti_silhouette(const disti_tracer *tracer, int worker, const disti
                 int x = i % w + (k == 0) - (k == 1), y = i / w + (k == 2) - (k == 3);
                 if (x < 0 || y < 0 || x >= w || y >= tile->height) continue;
                 const disti_ray *other = &bench->rays[y * w + x];
-                if (disti_wants_minimum(other) && other->fbest < best->fbest) best = other;
+                if (disti_has_minimum(other) && other->fbest < best->fbest) best = other;
             }
             float away = disti_ray_distance(best) - disti_ray_distance(ray);
             if (away * away > 4e-4f * radius * radius)
@@ -10032,8 +10037,9 @@ typedef struct disti_warm {
     const disti_bench *bench;
     int worker, n, silhouette;
     float *moved;         /* of each pixel: how far its hit has moved; 3e38: not known */
+    float *drift;         /* of each miss, with a silhouette: how its least f has changed; 3e38: not known */
     unsigned char *open;  /* 1: not decided by the cones; 2: and its hit was not where it was looked for */
-    float change;         /* largest change of f, no less than its mean over the picture */
+    float change, mean;   /* largest change of f in the tile, no less than its mean over the picture */
     size_t count;         /* of bench->index */
 } disti_warm;
 
@@ -10137,15 +10143,15 @@ static void disti_warm_newton(disti_warm *warm)
 }
 
 /* Interpolated from the corners of the pixel's 8 x 8 block, as far as they are known. */
-static float disti_warm_guess(const disti_warm *warm, int i)
+static float disti_warm_guess(const disti_warm *warm, const float *moved, int i)
 {
     int width = warm->tile->width, height = warm->tile->height, x = i % width, y = i / width;
     float sum = 0.0f, weights = 0.0f;
     for (int k = 0; k < 4; k++) {
         int right = k & 1, down = k >> 1, cx = (x & ~7) + 8 * right, cy = (y & ~7) + 8 * down;
-        if (cx >= width || cy >= height || warm->moved[cy * width + cx] > 2e38f) continue;
+        if (cx >= width || cy >= height || moved[cy * width + cx] > 2e38f) continue;
         float weight = (float)((right ? x & 7 : 8 - (x & 7)) * (down ? y & 7 : 8 - (y & 7)));
-        sum += weight * warm->moved[cy * width + cx];
+        sum += weight * moved[cy * width + cx];
         weights += weight;
     }
     return weights > 0.0f ? sum / weights : 3e38f;
@@ -10160,7 +10166,7 @@ static int disti_warm_asks(const disti_warm *warm, int x, int y)
 
 /* Mean of the moves of the pixels around that were asked, two beside it or four at its corners; *spread gets how much
    they differ, 3e38 if too few are known. */
-static float disti_warm_between(const disti_warm *warm, int i, float *spread)
+static float disti_warm_between(const disti_warm *warm, const float *moves, int i, float *spread)
 {
     int width = warm->tile->width, height = warm->tile->height, x = i % width, y = i / width, known = 0, all = 0,
         border = 0;
@@ -10173,7 +10179,7 @@ static float disti_warm_between(const disti_warm *warm, int i, float *spread)
                 border = 1;
                 continue;
             }
-            float moved = warm->moved[i + dy * width + dx];
+            float moved = moves[i + dy * width + dx];
             if (moved > 2e38f) continue;
             known++;
             low = DISTI_MIN(low, moved);
@@ -10182,7 +10188,7 @@ static float disti_warm_between(const disti_warm *warm, int i, float *spread)
         }
     }
     float mean = known > 0 ? sum / (float)known : 3e38f, guess = 3e38f;
-    if (border) guess = disti_warm_guess(warm, i);
+    if (border) guess = disti_warm_guess(warm, moves, i);
     if (known > 0 && guess < 2e38f) {
         low = DISTI_MIN(low, guess);
         high = DISTI_MAX(high, guess);
@@ -10202,8 +10208,8 @@ static int disti_warm_hits(disti_warm *warm)
             if (pass == 0 ? (x | y) & 7 : disti_warm_asks(warm, x, y) == (pass == 2)) continue;
             size_t pixel = disti_warm_pixel(warm, i);
             float spread = 3e38f, s = warm->tape->s[pixel];
-            float move = pass == 2 ? disti_warm_between(warm, i, &spread) : 0.0f;
-            if (pass > 0 && spread > 2e38f) move = disti_warm_guess(warm, i);
+            float move = pass == 2 ? disti_warm_between(warm, warm->moved, i, &spread) : 0.0f;
+            if (pass > 0 && spread > 2e38f) move = disti_warm_guess(warm, warm->moved, i);
             if (move > 2e38f) move = 0.0f;
             if (!disti_warm_expects(warm, i, s + move) || disti_warm_due(warm, i, DISTI_WARM_HITS)) continue;
             disti_ray *ray = &warm->bench->rays[i];
@@ -10226,11 +10232,13 @@ static int disti_warm_hits(disti_warm *warm)
     return 1;
 }
 
-/* Whether it is the turn of the pixel's 4 x 4 block to have the places of its least |f| looked for anew. */
-static int disti_warm_minimum_due(const disti_warm *warm, int i)
+/* Whether it is the tile's turn to have all of its least |f| looked for anew: while the picture has moved by about a
+   hundredth of the radius at most, in 2 to 8 turns. */
+static int disti_warm_minima_due(const disti_warm *warm, float change)
 {
-    int x = i % warm->tile->width, y = i / warm->tile->width;
-    return ((unsigned)(x / 4 * 5 + y / 4 * 3) + warm->tape->turn) % DISTI_WARM_MINIMA == 0;
+    unsigned period = 2, x = (unsigned)warm->tile->x / DISTI_TILE, y = (unsigned)warm->tile->y / DISTI_TILE;
+    while (period < DISTI_WARM_MINIMA && 2.0f * (float)period * change < 8e-3f * warm->tracer->field->radius) period *= 2;
+    return !warm->tape->has_silhouette || (x * 5u + y * 3u + warm->tape->turn) % period == 0;
 }
 
 /* One sample f at ray->q of a ray that passes close by a surface; ray->s, f: the lowest one so far. Samples on both
@@ -10322,40 +10330,96 @@ static void disti_warm_near(disti_warm *warm, size_t count)
     }
 }
 
-/* The misses. With a silhouette their |f| is asked for near the outline, elsewhere every 4th turn, not at all where f
-   is clamped; and in one 4 x 4 block of eight the place of the least |f| is looked for anew. */
+/* Whether the tape's miss of ray i still stands if f was positive where it is least: no cone says otherwise. */
+static int disti_warm_misses_still(const disti_warm *warm, int i)
+{
+    size_t pixel = disti_warm_pixel(warm, i);
+    const disti_ray *ray = &warm->bench->rays[i];
+    if (warm->tape->status[pixel] != ((int)DIST_RAY_MISS | DISTI_TAPE_SAMPLE)) return 0;
+    if (!warm->open[i] || ray->mode == DISTI_DONE)
+        return !warm->open[i] && ray->status == DIST_RAY_MISS && ray->enter < ray->leave;
+    /* the cones went through here: nothing is known of a ray that they do not clear any more */
+    if (!(warm->tape->value[pixel] > 0.0f) && warm->tape->start[pixel] <= ray->enter) return 0;
+    return !(ray->guard > 2e38f) && disti_warm_reaches(warm, i) && !disti_warm_due(warm, i, DISTI_WARM_MISSES);
+}
+
+/* Change of the least f of miss i between nodes h pixels apart, as far as all four are known and changed alike: to
+   within a quarter of what changes at all or .003 of f itself. 3e38: not known. */
+static float disti_warm_drift(const disti_warm *warm, int i, int h, float f)
+{
+    int width = warm->tile->width, height = warm->tile->height, x = i % width, y = i / width;
+    int x0 = x / h * h, x1 = DISTI_MIN(x0 + h, width - 1), y0 = y / h * h, y1 = DISTI_MIN(y0 + h, height - 1);
+    float u = (float)(x - x0) / (float)DISTI_MAX(x1 - x0, 1), v = (float)(y - y0) / (float)DISTI_MAX(y1 - y0, 1);
+    float a = warm->drift[y0 * width + x0], b = warm->drift[y0 * width + x1], c = warm->drift[y1 * width + x0],
+          d = warm->drift[y1 * width + x1];
+    float low = DISTI_MIN(DISTI_MIN(a, b), DISTI_MIN(c, d)), high = DISTI_MAX(DISTI_MAX(a, b), DISTI_MAX(c, d));
+    if (high > 2e38f || high - low > DISTI_MAX(0.25f * warm->change, 2e-2f * f)) return 3e38f;
+    return (1.0f - v) * ((1.0f - u) * a + u * b) + v * ((1.0f - u) * c + u * d);
+}
+
+/* With a silhouette: how the least |f| of each miss has changed. f is asked for where it was least, at every 8th pixel,
+   where f is below .05 radii at every 4th, below .02 at a quarter of them in turn; between these the change is
+   interpolated. To first order f changes there as its least does (envelope theorem). */
+static void disti_warm_drifts(disti_warm *warm)
+{
+    const disti_bench *bench = warm->bench;
+    const dist_field *field = warm->tracer->field;
+    float clamp = 1.5f * (field->clamp > 0.0f ? field->clamp : 0.1f * field->radius), far = 0.05f * field->radius;
+    for (int h = 8; h >= 1; h /= 2) {
+        size_t count = 0;
+        for (int i = 0; i < warm->n; i++) {
+            size_t pixel = disti_warm_pixel(warm, i);
+            const disti_ray *ray = &bench->rays[i];
+            int x = i % warm->tile->width, y = i / warm->tile->width, asks = disti_warm_asks(warm, x, y);
+            float f = warm->tape->value[pixel], drift = 3e38f, spread = 3e38f;
+            if (warm->drift[i] < 2e38f || !disti_warm_misses_still(warm, i)) continue;
+            if (h > 2 ? !disti_silhouette_node(warm->tile, x, y, h) : h == 2 && (!asks || f > far)) continue;
+            if (h == 8 && f > clamp && ((unsigned)((x ^ y) / 8) + warm->tape->turn) % 4u != 0) drift = 0.0f;
+            if (h < 8 && f > far) drift = disti_warm_drift(warm, i, 8, f);
+            if (h < 4 && f > 0.4f * far && drift > 2e38f) drift = disti_warm_drift(warm, i, 4, f);
+            if (h == 1 && drift > 2e38f) drift = disti_warm_between(warm, warm->drift, i, &spread);
+            if (spread < 2e38f && !(spread < DISTI_MAX(0.25f * warm->change, 3e-3f * f))) drift = 3e38f;
+            warm->drift[i] = drift;
+            if (drift < 2e38f) continue;
+            disti_ray_point(ray, warm->tape->s[pixel], bench->points + 3 * count);
+            bench->index[count++] = i;
+        }
+        size_t asked = disti_silhouette_eval(warm->tracer, warm->worker, bench, count);
+        for (size_t k = 0; k < asked; k++) {
+            int i = bench->index[k];
+            float value = warm->tape->value[disti_warm_pixel(warm, i)];
+            warm->drift[i] = disti_finite(bench->sdf[k]) ? bench->sdf[k] - value : 3e38f;
+            if (value > bench->sdf[k] && value < 0.4f * far) disti_warm_change(warm, warm->drift[i]);
+        }
+    }
+}
+
+/* The misses. Without a silhouette |f| is known not to be below tape->value less what has changed since; with one it is
+   known by disti_warm_drifts. Where it may be near 0 it is asked for, and looked at on both sides. */
 static void disti_warm_misses(disti_warm *warm)
 {
     const disti_bench *bench = warm->bench;
     const dist_field *field = warm->tracer->field;
-    float clamp = field->clamp > 0.0f ? field->clamp : 0.1f * field->radius, loss = warm->change;
+    float loss = warm->change;
+    int due = warm->silhouette && disti_warm_minima_due(warm, warm->mean);
     size_t count = 0, near = 0;
+    for (int i = 0; i < warm->n; i++) warm->drift[i] = 3e38f;
+    if (warm->silhouette && !due) disti_warm_drifts(warm);
     for (int i = 0; i < warm->n; i++) {
         size_t pixel = disti_warm_pixel(warm, i);
         disti_ray *ray = &bench->rays[i];
-        unsigned x = (unsigned)(i % warm->tile->width), y = (unsigned)(i / warm->tile->width);
-        int blocked = warm->open[i] && ray->mode != DISTI_DONE;
-        if (warm->tape->status[pixel] != ((int)DIST_RAY_MISS | DISTI_TAPE_SAMPLE)) continue;
-        if (!blocked && (warm->open[i] || ray->status != DIST_RAY_MISS || !(ray->enter < ray->leave))) continue;
+        int blocked = ray->mode != DISTI_DONE;
+        if ((due && !blocked) || !disti_warm_misses_still(warm, i)) continue;
         float f = warm->tape->value[pixel], epsilon = disti_ray_epsilon(warm->tracer, ray, ray->start);
-        /* the cones went through here: nothing is known of a ray that they do not clear any more */
-        if (blocked && !(f > 0.0f) && warm->tape->start[pixel] <= ray->enter) continue;
-        if (blocked && (ray->guard > 2e38f || !disti_warm_reaches(warm, i) ||
-            disti_warm_due(warm, i, DISTI_WARM_MISSES)))
-            continue;
-        int due = disti_warm_minimum_due(warm, i);
-        if (!blocked && warm->silhouette && due) continue;
-        float lower = warm->silhouette ? f - 12.0f * loss : f - loss;
-        int ask = blocked && lower < 3.0f * (warm->change + epsilon);
-        if (warm->silhouette && f < 0.98f * clamp) ask |= f < 0.2f * clamp || due ||
-            ((x ^ y) + warm->tape->turn) % 4u == 0;
+        float lower = !warm->silhouette ? f - loss : due ? f - 12.0f * loss : f + warm->drift[i];
         ray->best = warm->tape->s[pixel];
         ray->moved = 0;
-        if (ask) {
+        if (lower > 2e38f) continue;
+        if (blocked && (due || lower < 3.0f * (warm->change + epsilon))) {
             disti_ray_point(ray, ray->best, bench->points + 3 * count);
             bench->index[count++] = i;
         } else {
-            disti_ray_end(ray, DIST_RAY_MISS, ray->best, warm->silhouette ? f : DISTI_MAX(lower, 0.0f), 0.0f);
+            disti_ray_end(ray, DIST_RAY_MISS, ray->best, DISTI_MAX(lower, 0.0f), 0.0f);
             ray->kept = 1;
         }
     }
@@ -10363,7 +10427,7 @@ static void disti_warm_misses(disti_warm *warm)
     *(warm->silhouette ? &bench->stats->silhouette_queries : &bench->stats->refine_queries) += count;
     for (size_t k = 0; k < count; k++) {
         float value = warm->tape->value[disti_warm_pixel(warm, bench->index[k])]; /* 0: not measured */
-        if (value > bench->sdf[k]) warm->change = DISTI_MAX(warm->change, value - bench->sdf[k]);
+        if (value > bench->sdf[k]) disti_warm_change(warm, value - bench->sdf[k]);
     }
     for (size_t k = 0; k < count; k++) {
         int i = bench->index[k];
@@ -10376,7 +10440,7 @@ static void disti_warm_misses(disti_warm *warm)
         ray->s = ray->best;
         if (f > margin) {
             disti_ray_end(ray, DIST_RAY_MISS, ray->best, warm->silhouette ? f : 0.5f * f, 0.0f);
-            ray->kept = !warm->silhouette || !disti_warm_minimum_due(warm, i);
+            ray->kept = !due;
         } else if (f > 0.0f || warm->open[i]) {
             bench->index[near++] = i;
         }
@@ -10460,9 +10524,10 @@ static void disti_render_warm(const disti_render_job *job, int worker, const dis
     warm.worker = worker;
     warm.n = tile->width * tile->height;
     warm.silhouette = job->least;
-    warm.change = job->change;
+    warm.change = warm.mean = job->change;
     warm.moved = (float *)(void *)bench->rest;
-    warm.open = bench->rest + (size_t)warm.n * sizeof(float);
+    warm.drift = warm.moved + warm.n;
+    warm.open = bench->rest + (size_t)warm.n * 2 * sizeof(float);
     for (int i = 0; i < warm.n; i++) {
         warm.moved[i] = 3e38f;
         warm.open[i] = bench->rays[i].mode != DISTI_DONE;

@@ -10237,7 +10237,8 @@ static int disti_warm_hits(disti_warm *warm)
 static int disti_warm_minima_due(const disti_warm *warm, float change)
 {
     unsigned period = 2, x = (unsigned)warm->tile->x / DISTI_TILE, y = (unsigned)warm->tile->y / DISTI_TILE;
-    while (period < DISTI_WARM_MINIMA && 2.0f * (float)period * change < 8e-3f * warm->tracer->field->radius) period *= 2;
+    float most = 4e-3f * warm->tracer->field->radius;
+    while (period < DISTI_WARM_MINIMA && (float)period * change < most) period *= 2;
     return !warm->tape->has_silhouette || (x * 5u + y * 3u + warm->tape->turn) % period == 0;
 }
 

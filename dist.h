@@ -1908,7 +1908,8 @@ DISTI_PLAIN(scalar, static)
 /* One text serves every instruction set. It is written in these words, which each set defines for itself:
      DISTI_FUNCTION                     what stands before each of its functions
      DISTI_VEC, DISTI_LANES             a vector, and how many floats it holds
-     DISTI_SET1(s) DISTI_LOAD(p) DISTI_STORE(p, v) DISTI_ADD(a, b) DISTI_FMA(a, b, c)    the last is a b + c
+     DISTI_SET1(s) DISTI_LOAD(p) DISTI_STORE(p, v) DISTI_ADD(a, b)
+     DISTI_FMA(c, a, b)                 c += a b, in place: from intrinsics gcc makes copies and runs out of registers
      DISTI_RELU(v) DISTI_POSITIVE(v)    max(v, 0), and the bits of the lanes that are greater than 0
      DISTI_BITS(row, column, v)         the latter into a mask's row, from this column on
      DISTI_KEEP(v, bits)                v with 0 where the lane's bit is 0
@@ -1930,14 +1931,12 @@ DISTI_PLAIN(scalar, static)
 #define DISTI_Y8(M, V) DISTI_Y4(M, V) M(4, V) M(5, V) M(6, V) M(7, V)
 
 #define DISTI_ZERO1(i, j) DISTI_VEC a##i##j = DISTI_SET1(0.0f);
-#define DISTI_BIAS1(i, j) a##i##j = DISTI_SET1(bias[i]);
 #define DISTI_AGAIN1(i, j) a##i##j = DISTI_LOAD(y + i * DISTI_BLOCK + j * DISTI_LANES);
 #define DISTI_ZERO(i, V) DISTI_X##V(DISTI_ZERO1, i)
-#define DISTI_BIAS(i, V) DISTI_X##V(DISTI_BIAS1, i)
 #define DISTI_AGAIN(i, V) DISTI_X##V(DISTI_AGAIN1, i)
 
 #define DISTI_INPUT(i, j) const DISTI_VEC x##j = DISTI_LOAD(xs + j * DISTI_LANES);
-#define DISTI_MAC(i, j) a##i##j = DISTI_FMA(b, x##j, a##i##j);
+#define DISTI_MAC(i, j) DISTI_FMA(a##i##j, b, x##j);
 #define DISTI_SIDE(i, V) { const DISTI_VEC b = DISTI_SET1(ws[i]); DISTI_X##V(DISTI_MAC, i) }
 #define DISTI_APART(i, V) { const DISTI_VEC b = DISTI_SET1(ws[k##i]); DISTI_X##V(DISTI_MAC, i) }
 #define DISTI_STEP(R, V, FACTORS, w, x) \
@@ -1957,13 +1956,19 @@ DISTI_PLAIN(scalar, static)
 #define DISTI_VECTORS(floats) (((floats) + DISTI_LANES - 1) / DISTI_LANES)
 
 #define DISTI_STORE_RELU1(i, j)                                                                                        \
+    a##i##j = DISTI_ADD(a##i##j, b);                                                                                   \
     DISTI_BITS(mask + i, c + j * DISTI_LANES, a##i##j)                                                                 \
     DISTI_STORE(y + i * DISTI_BLOCK + j * DISTI_LANES, DISTI_RELU(a##i##j));
-#define DISTI_STORE_POSITIVE1(i, j) DISTI_STORE(y + i * DISTI_BLOCK + j * DISTI_LANES, DISTI_RELU(a##i##j));
-#define DISTI_STORE_POSITIVE(i, V) DISTI_X##V(DISTI_STORE_POSITIVE1, i)
-#define DISTI_STORE_SUM1(i, j) DISTI_STORE(y + i * DISTI_BLOCK + j * DISTI_LANES, DISTI_ADD(a##i##j, DISTI_SET1(0.0f)));
-#define DISTI_STORE_SUM(i, V) DISTI_X##V(DISTI_STORE_SUM1, i)
-#define DISTI_STORE_RELU(i, V) DISTI_X##V(DISTI_STORE_RELU1, i)
+#define DISTI_STORE_POSITIVE1(i, j) \
+    DISTI_STORE(y + i * DISTI_BLOCK + j * DISTI_LANES, DISTI_RELU(DISTI_ADD(a##i##j, b)));
+/* Minus zero becomes zero, so that a zero row left out cannot show in its sign. */
+#define DISTI_STORE_SUM1(i, j) \
+    DISTI_STORE(y + i * DISTI_BLOCK + j * DISTI_LANES, DISTI_ADD(DISTI_ADD(a##i##j, b), DISTI_SET1(0.0f)));
+#define DISTI_STORE_PART1(i, j) DISTI_STORE(y + i * DISTI_BLOCK + j * DISTI_LANES, a##i##j);
+#define DISTI_STORE_PART(i, V) DISTI_X##V(DISTI_STORE_PART1, i)
+#define DISTI_STORE_SUM(i, V) { const DISTI_VEC b = DISTI_SET1(bias[i]); DISTI_X##V(DISTI_STORE_SUM1, i) }
+#define DISTI_STORE_RELU(i, V) { const DISTI_VEC b = DISTI_SET1(bias[i]); DISTI_X##V(DISTI_STORE_RELU1, i) }
+#define DISTI_STORE_POSITIVE(i, V) { const DISTI_VEC b = DISTI_SET1(bias[i]); DISTI_X##V(DISTI_STORE_POSITIVE1, i) }
 
 /* Takes inputs from..to-1 of the list or of all; between two passes over DISTI_DEPTH rows the sums wait in y.
    Weights are fetched `ahead` floats early: a little, or a whole panel where passes cut the panels. */
@@ -1977,9 +1982,7 @@ DISTI_PLAIN(scalar, static)
         const float *bias = g->bias + o;                                                                               \
         float *y = g->y + at * DISTI_BLOCK + c;                                                                        \
         DISTI_Y##R(DISTI_ZERO, V)                                                                                      \
-        if (from == 0) {                                                                                               \
-            DISTI_Y##R(DISTI_BIAS, V)                                                                                  \
-        } else {                                                                                                       \
+        if (from > 0) {                                                                                                \
             DISTI_Y##R(DISTI_AGAIN, V)                                                                                 \
         }                                                                                                              \
         if (g->alive) {                                                                                                \
@@ -1992,17 +1995,16 @@ DISTI_PLAIN(scalar, static)
             const float *end = w + (size_t)(unsigned)to * 8;                                                           \
             w += (size_t)(unsigned)from * 8;                                                                           \
             x += (size_t)(unsigned)from * DISTI_BLOCK;                                                                 \
-            for (; DISTI_UNROLLED && end - w >= 4 * 8; w += 4 * 8, x += 4 * DISTI_BLOCK) {                             \
+            for (; DISTI_UNROLLED && end - w >= 2 * 8; w += 2 * 8, x += 2 * DISTI_BLOCK) {                             \
                 DISTI_AHEAD(w, ahead);                                                                                 \
-                DISTI_AHEAD(w + 16, ahead);                                                                            \
                 DISTI_STEP(R, V, DISTI_SIDE, w, x)                                                                     \
                 DISTI_STEP(R, V, DISTI_SIDE, w + 8, x + DISTI_BLOCK)                                                   \
-                DISTI_STEP(R, V, DISTI_SIDE, w + 16, x + 2 * DISTI_BLOCK)                                              \
-                DISTI_STEP(R, V, DISTI_SIDE, w + 24, x + 3 * DISTI_BLOCK)                                              \
             }                                                                                                          \
             for (; w < end; w += 8, x += DISTI_BLOCK) DISTI_STEP(R, V, DISTI_SIDE, w, x)                               \
         }                                                                                                              \
-        if (to < (g->alive ? g->alive_count : g->rows) || !(g->mask || g->relu)) {                                     \
+        if (to < (g->alive ? g->alive_count : g->rows)) {                                                              \
+            DISTI_Y##R(DISTI_STORE_PART, V)                                                                            \
+        } else if (!g->mask && !g->relu) {                                                                             \
             DISTI_Y##R(DISTI_STORE_SUM, V)                                                                             \
         } else if (g->mask) {                                                                                          \
             uint64_t *mask = g->mask + o;                                                                              \
@@ -2111,7 +2113,11 @@ DISTI_PLAIN(scalar, static)
         }                                                                                                              \
     }
 #define DISTI_OUTER1(i, j)                                                                                             \
-    DISTI_STORE(to + j * DISTI_LANES, DISTI_KEEP(DISTI_FMA(b, x##j, zero), bits >> (j * DISTI_LANES)));
+    {                                                                                                                  \
+        DISTI_VEC product = zero;                                                                                      \
+        DISTI_FMA(product, b, x##j);                                                                                   \
+        DISTI_STORE(to + j * DISTI_LANES, DISTI_KEEP(product, bits >> (j * DISTI_LANES)));                             \
+    }
 #define DISTI_LAST_LAYER(isa)                                                                                          \
     DISTI_FUNCTION void disti_dot_##isa(                                                                               \
         const float *w, float bias_value, const float *matrix, const int *alive, int alive_count, int rows,            \
@@ -2122,7 +2128,6 @@ DISTI_PLAIN(scalar, static)
         for (int c = 0; c < columns; c += 3 * DISTI_LANES) {                                                           \
             float *y = out + c;                                                                                        \
             DISTI_ZERO(0, 3)                                                                                           \
-            DISTI_BIAS(0, 3)                                                                                           \
             for (int n = 0; n < count; n++) {                                                                          \
                 const size_t k0 = (size_t)(unsigned)(alive ? alive[n] : n);                                            \
                 DISTI_STEP(1, 3, DISTI_APART, w, matrix + k0 * DISTI_BLOCK + c)                                        \
@@ -2240,7 +2245,7 @@ static const int *disti_back_rows(const disti_gemm_back *g, int rows, int n, int
 #define DISTI_LOAD(p) _mm_loadu_ps(p)
 #define DISTI_STORE(p, v) _mm_storeu_ps(p, v)
 #define DISTI_ADD(a, b) _mm_add_ps(a, b)
-#define DISTI_FMA(a, b, c) _mm_add_ps(_mm_mul_ps(a, b), c)
+#define DISTI_FMA(c, a, b) c = _mm_add_ps(_mm_mul_ps(a, b), c)
 #define DISTI_RELU(v) _mm_max_ps(v, _mm_setzero_ps())
 #define DISTI_POSITIVE(v) (unsigned)_mm_movemask_ps(_mm_cmpgt_ps(v, _mm_setzero_ps()))
 #define DISTI_BITS(row, column, v) *(row) |= (uint64_t)DISTI_POSITIVE(v) << (column);
@@ -2273,7 +2278,11 @@ DISTI_KERNELS(sse2, 4, 2)
 #define DISTI_LOAD(p) _mm256_loadu_ps(p)
 #define DISTI_STORE(p, v) _mm256_storeu_ps(p, v)
 #define DISTI_ADD(a, b) _mm256_add_ps(a, b)
-#define DISTI_FMA(a, b, c) _mm256_fmadd_ps(a, b, c)
+#ifdef _MSC_VER
+#define DISTI_FMA(c, a, b) c = _mm256_fmadd_ps(a, b, c)
+#else
+#define DISTI_FMA(c, a, b) __asm__("vfmadd231ps %1, %2, %0" : "+x"(c) : "x"(b), "x"(a))
+#endif
 #define DISTI_RELU(v) _mm256_max_ps(v, _mm256_setzero_ps())
 #define DISTI_POSITIVE(v) (unsigned)_mm256_movemask_ps(_mm256_cmp_ps(v, _mm256_setzero_ps(), _CMP_GT_OQ))
 #define DISTI_BITS(row, column, v) ((unsigned char *)(row))[(column) / 8] = (unsigned char)DISTI_POSITIVE(v);
@@ -2284,7 +2293,7 @@ DISTI_FUNCTION __m256 disti_keep_avx2(__m256 v, int bits)
     const __m256i both = _mm256_and_si256(_mm256_set1_epi32(bits), lane);
     return _mm256_and_ps(v, _mm256_castsi256_ps(_mm256_cmpeq_epi32(both, lane)));
 }
-#define DISTI_DEPTH 512
+#define DISTI_DEPTH 112
 DISTI_KERNELS(avx2, 4, 3)
 #undef DISTI_FUNCTION
 #undef DISTI_VEC
@@ -2307,7 +2316,11 @@ DISTI_KERNELS(avx2, 4, 3)
 #define DISTI_LOAD(p) _mm512_loadu_ps(p)
 #define DISTI_STORE(p, v) _mm512_storeu_ps(p, v)
 #define DISTI_ADD(a, b) _mm512_add_ps(a, b)
-#define DISTI_FMA(a, b, c) _mm512_fmadd_ps(a, b, c)
+#ifdef _MSC_VER
+#define DISTI_FMA(c, a, b) c = _mm512_fmadd_ps(a, b, c)
+#else
+#define DISTI_FMA(c, a, b) __asm__("vfmadd231ps %1, %2, %0" : "+v"(c) : "v"(b), "v"(a))
+#endif
 /* Unmasked, gcc 12 warns in C++ that its own header uses an uninitialized variable. */
 #define DISTI_RELU(v) _mm512_maskz_max_ps((__mmask16)0xffff, v, _mm512_setzero_ps())
 #define DISTI_POSITIVE(v) _mm512_cmp_ps_mask(v, _mm512_setzero_ps(), _CMP_GT_OQ)
@@ -2427,19 +2440,14 @@ typedef struct disti_half {
 #undef DISTI_FUNCTION
 #undef DISTI_FMA
 #define DISTI_FUNCTION DISTI_TARGET("avx512f,avx512bw,avx512dq,avx512vl,fma,avx512fp16") DISTI_KERNEL static
-#define DISTI_FMA(a, b, c) disti_fma_f16(a, b, c)
+/* By name also because clang 14's intrinsics are there only where the whole program is built for them. */
+#define DISTI_FMA(c, a, b) __asm__("vfmadd231ph %1, %2, %0" : "+v"(c) : "v"(b), "v"(a))
 #define DISTI_COLUMNS (2 * DISTI_BLOCK)
 #define DISTI_WIDEN 2
 #define DISTI_ROWS 1
 #define DISTI_SHORT 128
 #define DISTI_FLUSH1(i, j) disti_flush_f16(sums + i * DISTI_COLUMNS + j * 32, a##i##j);
 #define DISTI_NARROW(p) disti_narrow_f16(p)
-/* By name, not by intrinsics: clang 14's are there only where the whole program is built for them. */
-DISTI_TARGET("avx512f,avx512fp16") DISTI_INLINE __m512 disti_fma_f16(__m512 a, __m512 b, __m512 c)
-{
-    __asm__("vfmadd231ph %1, %2, %0" : "+v"(c) : "v"(b), "v"(a));
-    return c;
-}
 DISTI_FUNCTION void disti_flush_f16(float *sum, __m512 v)
 {
     const __m512 both = _mm512_maskz_shuffle_f32x4(0xffff, v, v, 0xee); /* the upper half, twice */
@@ -2465,18 +2473,13 @@ DISTI_HALF_KERNEL(f16)
 #undef DISTI_FLUSH1
 #undef DISTI_NARROW
 #define DISTI_FUNCTION DISTI_TARGET("avx512f,avx512bw,avx512dq,avx512vl,fma,avx512bf16") DISTI_KERNEL static
-#define DISTI_FMA(a, b, c) disti_fma_bf16(a, b, c)
+#define DISTI_FMA(c, a, b) __asm__("vdpbf16ps %1, %2, %0" : "+v"(c) : "v"(b), "v"(a))
 #define DISTI_COLUMNS DISTI_BLOCK
 #define DISTI_WIDEN 1
 #define DISTI_ROWS 2
 #define DISTI_SHORT (1 << 30)
 #define DISTI_FLUSH1(i, j) disti_flush_bf16(sums + i * DISTI_COLUMNS + j * 16, a##i##j);
 #define DISTI_NARROW(p) disti_narrow_bf16(p)
-DISTI_TARGET("avx512f,avx512bf16") DISTI_INLINE __m512 disti_fma_bf16(__m512 a, __m512 b, __m512 c)
-{
-    __asm__("vdpbf16ps %1, %2, %0" : "+v"(c) : "v"(b), "v"(a));
-    return c;
-}
 DISTI_FUNCTION void disti_flush_bf16(float *sum, __m512 v)
 {
     _mm512_storeu_ps(sum, _mm512_add_ps(_mm512_loadu_ps(sum), v));
@@ -2525,7 +2528,7 @@ DISTI_HALF_KERNEL(bf16)
 #define DISTI_LOAD(p) vld1q_f32(p)
 #define DISTI_STORE(p, v) vst1q_f32(p, v)
 #define DISTI_ADD(a, b) vaddq_f32(a, b)
-#define DISTI_FMA(a, b, c) vfmaq_f32(c, a, b)
+#define DISTI_FMA(c, a, b) c = vfmaq_f32(c, a, b)
 #define DISTI_RELU(v) disti_positive_part(v)
 #define DISTI_POSITIVE(v) disti_positive_neon(v)
 #define DISTI_BITS(row, column, v) *(row) |= (uint64_t)DISTI_POSITIVE(v) << (column);
@@ -2599,10 +2602,8 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_Y4
 #undef DISTI_Y8
 #undef DISTI_ZERO1
-#undef DISTI_BIAS1
 #undef DISTI_AGAIN1
 #undef DISTI_ZERO
-#undef DISTI_BIAS
 #undef DISTI_AGAIN
 #undef DISTI_INPUT
 #undef DISTI_MAC
@@ -2617,6 +2618,8 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_STORE_POSITIVE1
 #undef DISTI_STORE_POSITIVE
 #undef DISTI_STORE_SUM1
+#undef DISTI_STORE_PART1
+#undef DISTI_STORE_PART
 #undef DISTI_STORE_SUM
 #undef DISTI_STORE_RELU
 #undef DISTI_GEMM_TILE

@@ -1652,11 +1652,9 @@ static void disti_outer_scalar(const float *w, const float *s, const int *alive,
     }
 }
 
-/* exp to 2 ulp; below -87 it is 0, above 88 the largest float. */
-DISTI_INLINE float disti_exp(float x)
+/* exp to 2 ulp, x in [-87, 88] */
+DISTI_INLINE float disti_exp_within(float x)
 {
-    x = x < 88.0f ? x : 88.0f; /* also for NaN, which may stand in idle lanes */
-    x = x > -87.0f ? x : -87.0f;
     float n = x * 1.44269504f;
     int32_t k = (int32_t)(n < 0.0f ? n - 0.5f : n + 0.5f);
     n = (float)k;
@@ -1675,13 +1673,20 @@ DISTI_INLINE float disti_exp(float x)
     return p * scale;
 }
 
+/* exp; below -87 it is 0, above 88 the largest float. */
+DISTI_INLINE float disti_exp(float x)
+{
+    x = x < 88.0f ? x : 88.0f; /* also for NaN, which may stand in idle lanes */
+    return disti_exp_within(x > -87.0f ? x : -87.0f);
+}
+
 DISTI_INLINE float disti_tanh(float x)
 {
     float a = x < 0.0f ? -x : x;
     float s = x * x;
     float small = x + x * s * ((((-5.70498872745e-3f * s + 2.06390887954e-2f) * s - 5.37397155531e-2f) * s +
                                 1.33314422036e-1f) * s - 3.33332819422e-1f);
-    float large = 1.0f - 2.0f / (disti_exp(2.0f * (a > 20.0f ? 20.0f : a)) + 1.0f);
+    float large = 1.0f - 2.0f / (disti_exp_within(2.0f * (a < 20.0f ? a : 20.0f)) + 1.0f);
     large = x < 0.0f ? -large : large;
     return a < 0.625f ? small : large;
 }
@@ -5030,11 +5035,17 @@ static int disti_encoding_row(const dist_net *net, int level, int axis, int cosi
 
 static void disti_encode(const dist_net *net, size_t n, const float *points, float *rows)
 {
-    for (size_t c = 0; c < DISTI_BLOCK; c++) {
-        /* idle lanes repeat the last point: no unit lives for them alone */
+    /* idle lanes repeat the last point: no unit lives for them alone */
+    for (size_t c = 0; c < DISTI_BLOCK && net->raw; c++) {
         const float *p = points + 3 * (c < n ? c : n - 1);
-        for (size_t axis = 0; axis < 3 && net->raw; axis++) rows[axis * DISTI_BLOCK + c] = p[axis];
-        for (int axis = 0; axis < 3 && net->levels > 0; axis++) {
+        const float x = p[0], y = p[1], z = p[2];
+        rows[c] = x;
+        rows[DISTI_BLOCK + c] = y;
+        rows[2 * DISTI_BLOCK + c] = z;
+    }
+    for (size_t c = 0; c < DISTI_BLOCK && net->levels > 0; c++) {
+        const float *p = points + 3 * (c < n ? c : n - 1);
+        for (int axis = 0; axis < 3; axis++) {
             double s, co;
             disti_sincos(net->base * (double)p[axis], &s, &co);
             for (int k = 0; k < net->levels; k++) {
@@ -5270,8 +5281,9 @@ static void disti_net_output(const dist_shape *shape, const disti_block *b, cons
     float v[DISTI_BLOCK], d[DISTI_BLOCK], t[DISTI_BLOCK], bend[DISTI_BLOCK];
     float level = channel == net->sdf_channel ? net->level : 0.0f;
     int twice = net->output == DISTI_OUTPUT_TANH_TWICE;
-    for (size_t c = 0; c < DISTI_BLOCK; c++) {
-        v[c] = b->half ? value[c] + bias : value[c];
+    memcpy(v, value, sizeof v);
+    for (size_t c = 0; c < DISTI_BLOCK && b->half; c++) v[c] += bias;
+    for (size_t c = 0; c < DISTI_BLOCK && !b->values; c++) {
         d[c] = 1.0f;
         bend[c] = 0.0f;
     }
@@ -5450,15 +5462,26 @@ static void disti_net_reverse(const dist_shape *shape, disti_block *b, const flo
     }
 }
 
-/* Loads up to B points into the block and makes its worker's memory ready. */
-static void disti_block_begin(const dist_shape *shape, int worker, disti_block *b, size_t n, const float *points)
+/* Makes the worker's memory ready for blocks of n points in all. */
+static void disti_blocks_begin(const dist_shape *shape, int worker, disti_block *b, size_t n)
 {
     disti_block_layout(shape->net, disti_lane(shape->ctx, worker), b);
+    disti_counter_of(shape->ctx, worker)->dense += (double)dist_net_operations(shape->net, 1) * (double)n;
+}
+
+/* Loads up to B points into the block. */
+static void disti_block_load(const dist_shape *shape, disti_block *b, size_t n, const float *points)
+{
     b->columns = (int)n;
     b->channel = shape->net->sdf_channel;
     b->channels = 1;
     disti_encode(shape->net, n, points, b->point);
-    disti_counter_of(shape->ctx, worker)->dense += (double)dist_net_operations(shape->net, 1) * (double)n;
+}
+
+static void disti_block_begin(const dist_shape *shape, int worker, disti_block *b, size_t n, const float *points)
+{
+    disti_blocks_begin(shape, worker, b, n);
+    disti_block_load(shape, b, n, points);
 }
 
 /* d_code += sum over the layers that see the code of scale W_code^T S,  S[o] = sum over points of delta[o], for `count`
@@ -5508,12 +5531,12 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
     const dist_shape *shape = (const dist_shape *)user;
     const dist_net *net = shape->net;
     disti_block b;
-    disti_block_layout(net, disti_lane(shape->ctx, worker), &b);
+    disti_blocks_begin(shape, worker, &b, n);
+    b.values = !gradient && !seed_fn;
     if (d_code) memset(b.fold_sum, 0, (size_t)net->fold_count * (size_t)net->max_rows * sizeof(double));
     for (size_t at = 0; at < n; at += DISTI_BLOCK) {
         size_t count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK);
-        disti_block_begin(shape, worker, &b, count, points + 3 * at);
-        b.values = !gradient && !seed_fn;
+        disti_block_load(shape, &b, count, points + 3 * at);
         float *value = b.tail, *slope = b.tail + DISTI_BLOCK, *seed = b.tail + 2 * DISTI_BLOCK,
               *g = b.tail + 8 * DISTI_BLOCK;
         const float *x = disti_net_forward(shape, &b, NULL, disti_counter_of(shape->ctx, worker));

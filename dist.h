@@ -471,7 +471,8 @@ enum {
 typedef struct dist_render_desc {
     int max_steps;       /* queries per ray at most; 0: 100 guarded, 1000 certified, 50 paper */
     float step_scale;    /* alpha; 0: 1.5 (paper: rows aggressive and coarse-to-fine). Above 0 */
-    float epsilon; /* largest |f| of a hit, shape units; 0: 5e-5, or less where a pixel is smaller (see the README) */
+    float epsilon; /* largest |f| of a hit, shape units; 0: 5e-5, or less where a pixel is smaller (see the README). The
+                      guarded tracer takes at most half of field.clamp */
     int samples;         /* K of the paper's gradient, 1 to 8; 0: 1 */
     int trace;           /* DIST_TRACE_* */
     int paper_row;       /* DIST_PAPER_* */
@@ -7609,7 +7610,10 @@ static dist_status disti_tracer_init(disti_tracer *tracer, dist_context *ctx, co
     if (!(tracer->how.lipschitz > 0.0f) && field->lipschitz_far > 0.0f)
         tracer->ratio = tracer->lipschitz / field->lipschitz_far;
     tracer->noise = 5e-7f * field->radius;
-    tracer->epsilon = DISTI_MAX(tracer->how.epsilon, tracer->how.epsilon > 0.0f ? tracer->noise : 0.0f);
+    tracer->epsilon = tracer->how.epsilon;
+    if (field->clamp > 0.0f && tracer->how.trace == DIST_TRACE_GUARDED)
+        tracer->epsilon = DISTI_MIN(tracer->epsilon, 0.5f * field->clamp); /* a clamped f is near nothing */
+    tracer->epsilon = DISTI_MAX(tracer->epsilon, tracer->how.epsilon > 0.0f ? tracer->noise : 0.0f);
     return DIST_OK;
 }
 
@@ -7705,7 +7709,7 @@ static int disti_ray_bracket(const disti_tracer *tracer, disti_ray *ray)
 {
     float width = ray->b - ray->a, middle = 0.5f * (ray->a + ray->b);
     float epsilon = DISTI_MAX(disti_ray_epsilon(tracer, ray, ray->a), 2.4e-7f * tracer->field->radius);
-    float q = ray->a + width * (ray->fa / (ray->fa - ray->fb));
+    float q = ray->fa > ray->fb ? ray->a + width * (ray->fa / (ray->fa - ray->fb)) : middle; /* both may be 0 */
     if (width <= epsilon) {
         ray->slope = (ray->fb - ray->fa) / width;
         return disti_ray_end(ray, DIST_RAY_HIT, q, 0.0f, width);
@@ -7824,13 +7828,13 @@ static int disti_ray_trusts(const disti_tracer *tracer, const disti_ray *ray, fl
     return ray->mode == DISTI_JUMP && expected > 0.0f && (off < 0.0f ? -off : off) < 0.3f * ray->f;
 }
 
-/* Feels ahead in the band 0 < f < epsilon, farther each time. */
+/* Feels ahead in the band 0 < f < epsilon, farther each time; certified only as far as is proven empty. */
 static int disti_ray_feel(const disti_tracer *tracer, disti_ray *ray, float epsilon)
 {
     float reach = DISTI_MIN(2.0f * epsilon, 0.01f * tracer->field->radius);
     for (int i = 0; i < ray->side && reach < 0.01f * tracer->field->radius; i++) reach *= 1.5f;
     if (ray->slope < -1e-3f) reach = DISTI_MIN(1.2f * ray->f / -ray->slope, DISTI_MAX(reach, 64.0f * epsilon));
-    float q = ray->s + DISTI_MAX(reach, 0.5f * epsilon);
+    float q = ray->s + (tracer->how.certified ? disti_empty(tracer, ray->f) : DISTI_MAX(reach, 0.5f * epsilon));
     q = DISTI_MAX(q, ray->s + 4.8e-7f * tracer->field->radius);
     return disti_ray_ask(ray, DISTI_BAND, DISTI_MIN(q, ray->leave));
 }
@@ -7907,10 +7911,10 @@ static int disti_ray_band(const disti_tracer *tracer, disti_ray *ray, float f)
     if (f <= 0.0f && ray->f > 0.0f) return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->q, f);
     if (f < 0.0f)
         return disti_ray_end(ray, DIST_RAY_HIT, ray->s, 0.0f, 0.0f); /* the start is the surface, to the last bit */
-    ray->side++;
+    if (ray->side < 255) ray->side++;
     if (f < 0.5f * ray->fa) ray->moved = 1; /* toward another surface than the one that it began at */
     float fall = ray->b < ray->s ? (ray->fb - ray->f) / (ray->s - ray->b) * (ray->q - ray->s) : 0.0f; /* as before */
-    if (ray->moved && fall > 0.0f && (f >= ray->f || (f > 0.8f * ray->f && fall > ray->f))) {
+    if (ray->moved && fall > 0.0f && !tracer->how.certified && (f >= ray->f || (f > 0.8f * ray->f && fall > ray->f))) {
         ray->a = ray->b;
         ray->fa = ray->fb;
         ray->b = ray->q;
@@ -7929,10 +7933,13 @@ static int disti_ray_band(const disti_tracer *tracer, disti_ray *ray, float f)
         ray->fb = 0.0f; /* the band is over */
         return disti_ray_step(tracer, ray);
     }
-    if (ray->side >= 16) {
-        if (change < 1e-3f * all) return disti_ray_end(ray, DIST_RAY_PLATEAU, ray->s, f, 0.0f);
-        return disti_ray_end(ray, DIST_RAY_HIT, ray->s, f, f * all / change);
+    if (tracer->how.certified) { /* on until the steps are spent */
+        int last = ray->steps + 1 >= tracer->how.max_steps && !(change >= 1e-3f * all);
+        return last ? disti_ray_end(ray, DIST_RAY_PLATEAU, ray->s, f, 0.0f) : disti_ray_feel(tracer, ray, epsilon);
     }
+    if (ray->side >= 16 && !(change >= 1e-3f * all)) return disti_ray_end(ray, DIST_RAY_PLATEAU, ray->s, f, 0.0f);
+    if (ray->side >= 16 && f <= tracer->noise) return disti_ray_end(ray, DIST_RAY_HIT, ray->s, f, f * all / change);
+    if (ray->side >= 48) return disti_ray_give_up(ray); /* it falls, but to where? */
     return disti_ray_feel(tracer, ray, epsilon);
 }
 

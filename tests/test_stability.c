@@ -721,6 +721,20 @@ TEST(row_17_plates_and_rods)
                     v.missed);
         }
     }
+    /* found by random scenes: within an epsilon larger than the part, or than the clamp, certified rays strode on */
+    const double tubes[4] = {0.03, 0.03, 0.005, 0.03}, clamps[4] = {0, 0, 0, 0.013};
+    const float epsilons[4] = {0.11f, 0.01f, 2e-3f, 0.06f};
+    for (int k = 0; k < 8; k++) {
+        test_shape shape = shape_make(SHAPE_TORUS, 0.6, tubes[k % 4], 0, 0);
+        dist_render_desc how = defaults(DIST_TRACE_GUARDED);
+        shape.clamp = clamps[k % 4];
+        how.certified = 1;
+        how.no_cones = k / 4;
+        how.epsilon = epsilons[k % 4];
+        CHECK_STATUS(DIST_OK, draw(ctx, &shape, 1, 1, &camera, &how, &a), ctx);
+        verdict v = judge(&shape, &camera, 1e-4, &a, 1e-4);
+        SAY(v.missed == 0 && v.crossing > 20, "thin torus, certified, epsilon large: missed", "0", v.missed);
+    }
     dist_context_destroy(ctx);
 }
 
@@ -1211,6 +1225,15 @@ TEST(row_33_secant_with_equal_ends)
     dist_hit hit = shoot(ctx, &stairs, 1, o, d, NULL);
     SAY(test_finite((double)hit.error) && test_finite((double)hit.distance), "error of a flat hit", "finite",
         hit.error);
+    /* found by random scenes: f = 0 at both ends of a bracket, 0 / 0 */
+    disti_tracer tracer;
+    disti_ray ray;
+    dist_field field = shape_field(&stairs, 1, 1);
+    CHECK_STATUS(DIST_OK, disti_tracer_init(&tracer, ctx, &field, NULL, "test"), ctx);
+    memset(&ray, 0, sizeof ray);
+    for (int i = disti_ray_open_bracket(&tracer, &ray, 0.1f, 0, 0.2f, 0); i; i = disti_ray_advance(&tracer, &ray, 0)) {}
+    SAY(ray.best >= 0.1f && ray.best <= 0.2f && ray.status == DIST_RAY_HIT, "bracket of zeros: s", "0.1 to 0.2",
+        ray.best);
     dist_context_destroy(ctx);
 }
 
@@ -1659,6 +1682,7 @@ TEST(row_45_callbacks_that_call_back)
     nested x;
     dist_field outer;
     dist_camera camera = shape_camera(SIDE, SIDE);
+    memset(&x, 0, sizeof x);
     x.ctx = shape_context();
     x.inner = dist_field_sphere(ball);
     outer = x.inner;

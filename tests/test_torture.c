@@ -492,6 +492,18 @@ static double value_at(const scene_field *f, const double o[3], const double d[3
     return scene_value(f, p);
 }
 
+/* Whether |f| is at most `small` somewhere between t0 and t1: by steps that the slope allows. */
+static int comes_near(const scene_field *f, const double o[3], const double d[3], double t0, double t1, double slope,
+                      double small, double *m)
+{
+    for (int k = 0; k < 20000 && t0 <= t1; k++) {
+        *m = value_at(f, o, d, t0);
+        if (fabs(*m) <= small) return 1;
+        t0 += (fabs(*m) - 0.5 * small) / slope;
+    }
+    return t0 <= t1; /* undecided */
+}
+
 /* Hits: f is small there, or changes sign within the error. The surface's slope is known, so f small is judged by it.
    Misses, where the figure holds: no crossing deeper than rounding. */
 static void judge_truth(const scene *s, const planes *p, const scene_field *own)
@@ -521,13 +533,10 @@ static void judge_truth(const scene *s, const planes *p, const scene_field *own)
             double small = epsilon * (paper ? 1 + slope : 1.01) + 2 * slope * rounding;
             if (own->wild == WILD_HUGE) small *= 1e34;
             hits_judged++;
-            int good = (a > 0) != (b > 0) || fabs(m) <= small;
-            for (int k = 0; k < 64 && !good; k++) {
-                m = value_at(own, o, d, t - e + 2 * e * k / 63);
-                good = m <= small && m >= -small - 2 * slope * e;
-            }
-            int thin = rounding > 1e-4 * s->radius && own->shape.power < 0; /* a plate may lie between two samples */
-            if (!good && !thin) note(FALSE_HIT, "f, error", m, (double)p->error[i]);
+            int good = (a > 0) != (b > 0) || fabs(m) <= small || comes_near(own, o, d, t - e, t + e, slope, small, &m);
+            /* what jumps may do so between two samples, and a float is off along a grazing ray by many times its own */
+            if (!good && own->shape.power >= 0 && own->wild != WILD_STAIRS)
+                note(FALSE_HIT, "f, error", m, (double)p->error[i]);
         }
         if (p->status[i] == DIST_RAY_INSIDE && own->wild == WILD_NONE && !(own->shape.poison > 0)) {
             double f = value_at(own, o, d, meets ? t0 : 0);
@@ -550,7 +559,9 @@ static void judge_truth(const scene *s, const planes *p, const scene_field *own)
         } else {
             bounds_judged++;
             double e = (double)p->error[i] + 4 * rounding;
-            int nearer = value_at(own, o, d, t - e) * value_at(own, o, d, t + e) <= 0; /* than the judge's steps see */
+            double m = 0; /* nearer than the judge's steps see */
+            int nearer = value_at(own, o, d, t - e) * value_at(own, o, d, t + e) <= 0 ||
+                         comes_near(own, o, d, t - e, t + e, slope, slope * rounding, &m);
             if (fabs(x.t * s->radius - t) > e && !nearer)
                 note(BAD_BOUND, "off, error", fabs(x.t * s->radius - t), (double)p->error[i]);
         }
@@ -583,10 +594,10 @@ static void describe(const scene *s)
            (double)s->camera.skew, (double)s->camera.translation[0], (double)s->camera.translation[1],
            (double)s->camera.translation[2]);
     printf("    trace %d, row %d, steps %d, alpha %g, epsilon %g, samples %d, gradient %d, cap %g, normals %d %g, "
-           "inside %d, no_cones %d, no_prediction %d, max_queries %llu, pixels %d, planes %d\n",
+           "inside %d, no_cones %d, no_prediction %d, certified %d, max_queries %llu, pixels %d, planes %d\n",
            h->trace, h->paper_row, h->max_steps, (double)h->step_scale, (double)h->epsilon, h->samples, h->gradient,
            (double)h->gradient_cap, h->normal_mode, (double)h->normal_delta, h->inside, h->no_cones, h->no_prediction,
-           h->max_queries, h->pixels != NULL, s->planes);
+           h->certified, h->max_queries, h->pixels != NULL, s->planes);
 }
 
 static void one_scene(unsigned long seed)
@@ -619,6 +630,10 @@ TEST(random_scenes_keep_their_word)
     if (!stage_open(&stages[0], 1) || !stage_open(&stages[1], 3)) return;
     unsigned long from = only ? only : number_of("DIST_TORTURE_FIRST", 1);
     for (unsigned long i = 0; i < (only ? 1 : count); i++) one_scene(from + i);
+    /* found by other seeds: certified rays that strode through an epsilon larger than the part or than the clamp (first
+       five), a hit of what fell within epsilon but never ended, a bracket with 0 at both ends */
+    const unsigned long kept[7] = {1005801, 1005855, 1011869, 50009703, 50010779, 1009082, 900016283};
+    for (int i = 0; i < 7 && !only; i++) one_scene(kept[i]);
     for (int k = 0; k < KINDS; k++) {
         CHECK_EQUAL(0, found[k]);
         if (getenv("DIST_TORTURE")) printf("scenes,%s,0,%ld\n", kind_names[k], found[k]);

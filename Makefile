@@ -8,7 +8,8 @@
 #   make matrix-quick   the part of it that every change must pass
 #   make bench          the benchmarks in short, under ten minutes; CSV and plots also go to bench/results;
 #                       build/bench_NAME --help tells what else they do
-#   make results        the paper's tables and figures with ours beside them, into bench/results/: below an hour
+#   make results        the paper's tables and figures with ours beside them, into bench/results/: about an hour on two
+#                       cores that have nothing else to do
 #   make results-quick  the same in small, into build/results/: a minute or two
 #   make clean
 
@@ -80,11 +81,11 @@ demo: build/fit_depth
 bench: $(filter-out $(RESULTS),$(BENCHES))
 	@$(BENCH_COMMAND)
 
-results: $(RESULTS)
+results: $(RESULTS) build/bench_needs build/bench_work_precision
 	@sh bench/results.sh bench/results $(RESULTS)
 	@sh bench/readme.sh
 
-results-quick: $(RESULTS)
+results-quick: $(RESULTS) build/bench_needs build/bench_work_precision
 	@sh bench/results.sh --quick build/results $(RESULTS)
 
 test-programs: $(TESTS)

@@ -172,9 +172,9 @@ static void fit_one(dist_context *ctx, const settings *s, const fit_case *c, con
         render_reference(ctx, shape, code, &camera, p.depth, p.mask);
         score after = score_pictures(&target, p.depth, p.mask);
         double ratio = after.depth_error / before.depth_error;
-        printf("%s,%s,%s,%d,%.6f,%.6f,%.4f,%.4f,%.4f,%llu,%.2f\n", c->name,
-               trace_name(mode), gradient_name(mode->gradient), mode->samples, before.depth_error, after.depth_error, ratio,
-               before.iou, after.iou, total.queries, seconds);
+        printf("%s,%s,%s,%d,%.6f,%.6f,%.4f,%.4f,%.4f,%llu,%.2f\n", c->name, trace_name(mode),
+               gradient_name(mode->gradient), mode->samples, before.depth_error, after.depth_error, ratio, before.iou,
+               after.iou, total.queries, seconds);
         fflush(stdout);
         if (!(before.depth_error > 0 && after.depth_error > 0)) { continue; }
         tallies[m].count++;

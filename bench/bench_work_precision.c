@@ -21,8 +21,8 @@
    double, a network's derivatives too. norm_error: |g - exact| / |exact|. gradient_queries: those of the
    picture with a tape and the points of its adjoint. Warm pictures start from that of a code one part in 2000 away.
    guarded_dense leaves no dead unit out where only values are asked for. guarded_f16 and _bf16 take field.coarse_fn for
-   everything (dist_net_set_half): the bound is then one of the field in 16 bits and knows nothing of its rounding. Where
-   the processor has none of it the row says "not available".
+   everything (dist_net_set_half): the bound is then one of the field in 16 bits and knows nothing of its rounding.
+   Where the processor has none of it the row says "not available".
 
    --minutes bounds a case's size: its rows come in order of importance, defaults first. One is made with fewer runs
    (column `runs`) if 7 would take more than a quarter of the time, and is left out, with a word on stderr, where one
@@ -30,8 +30,8 @@
 
    --svg draws each case and size. Lines join the epsilons of one method, or its alphas or budgets of steps; the larger
    markers are the defaults. A marker is open where the picture failed: more than 1 in 1000 pixels that should be hit is
-   wrong, or as many hits of our own are farther off than their bound. STEM_losses.svg holds our default against the best
-   of all of the paper's rows, by each measure for itself: points above the line are where dist.h loses. */
+   wrong, or as many hits of our own are farther off than their bound. STEM_losses.svg holds our default against the
+   best of all of the paper's rows, by each measure for itself: points above the line are where dist.h loses. */
 #define DIST_IMPLEMENTATION
 #include "../dist.h"
 #include "../examples/common.h"
@@ -352,7 +352,7 @@ static void polish(const prober *p, size_t n, ray *rays, double *sdf)
         }
         probe_exactly(p, n, rays, sdf, 1);
         for (size_t i = 0; i < n; i++) {
-            if (fabs(sdf[i]) > fabs(before[i])) { rays[i].t = rays[i].previous; } /* a kink between; its slope will do */
+            if (fabs(sdf[i]) > fabs(before[i])) { rays[i].t = rays[i].previous; } /* a kink lies between */
         }
     }
     free(before);
@@ -781,7 +781,7 @@ static int failed(const row *r)
 
 /* A panel: error `y` over what it costs. */
 enum { OVER_QUERIES, OVER_SECONDS, OVER_OPERATIONS };
-enum { Y_MEAN, Y_P99, Y_MAX, Y_WRONG, Y_NORMAL, Y_NEAR, Y_CODE, Y_CAMERA };
+enum { Y_MEAN, Y_P99, Y_MAX, Y_WRONG, Y_NORMAL, Y_NEAR, Y_CODE, Y_CAMERA, Y_CODE_ANGLE, Y_CAMERA_ANGLE };
 
 typedef struct panel_of {
     const char *title;
@@ -798,6 +798,8 @@ static const panel_of panels[] = {
     {"silhouette near the outline, mean", Y_NEAR, OVER_QUERIES, 1e-8},
     {"gradient for the camera, relative", Y_CAMERA, OVER_QUERIES, 1e-7},
     {"gradient for the code, relative", Y_CODE, OVER_QUERIES, 1e-7},
+    {"for the camera, 1 - cosine", Y_CAMERA_ANGLE, OVER_QUERIES, 1e-12},
+    {"for the code, 1 - cosine", Y_CODE_ANGLE, OVER_QUERIES, 1e-12},
     {"distance, 99 % of the hits", Y_P99, OVER_SECONDS, 1e-8},
     {"holes and false hits per pixel to hit", Y_WRONG, OVER_SECONDS, 1e-5},
     {"silhouette near the outline, mean", Y_NEAR, OVER_SECONDS, 1e-8},
@@ -810,7 +812,7 @@ static double plot_x(const row *r, const panel_of *v)
     double pixels = (double)r->size * (double)r->size;
     if (v->over == OVER_SECONDS) { return v->y == Y_NEAR ? r->silhouette_seconds : r->seconds; }
     if (v->over == OVER_OPERATIONS) { return r->operations / pixels; }
-    if (v->y == Y_CODE || v->y == Y_CAMERA) { return r->gradient_queries / pixels; }
+    if (v->y >= Y_CODE) { return r->gradient_queries / pixels; }
     return (v->y == Y_NEAR ? r->silhouette_queries : r->queries) / pixels;
 }
 
@@ -824,7 +826,9 @@ static double plot_y(const row *r, const panel_of *v)
     case Y_NORMAL: return r->normal;
     case Y_NEAR: return r->near;
     case Y_CODE: return r->code_error;
-    default: return r->camera_error;
+    case Y_CAMERA: return r->camera_error;
+    case Y_CODE_ANGLE: return r->code_error < 0 ? -1 : fmax(0, 1 - r->code_cosine);
+    default: return r->camera_error < 0 ? -1 : fmax(0, 1 - r->camera_cosine);
     }
 }
 
@@ -839,7 +843,7 @@ static const char *line_of(const row *r, char room[64])
 /* Rows that differ in their gradient alone are shown among the gradients alone. */
 static int shown(const row *r, const panel_of *v)
 {
-    int of_gradient = v->y == Y_CODE || v->y == Y_CAMERA;
+    int of_gradient = v->y >= Y_CODE;
     if (!of_gradient && (r->m->gradient || r->m->uncapped)) { return 0; }
     if (of_gradient && (r->m->warm || r->m->dense || r->m->half)) { return 0; }
     return plot_y(r, v) >= 0 && (v->over != OVER_OPERATIONS || r->operations > 0);
@@ -992,14 +996,14 @@ static void add_row(sweep *w, const method *m, const char *parameter, double val
    a quick sweep are every second of all. */
 static void sweep_values(sweep *w, const char *parameter, size_t count, const double *values)
 {
-    int epsilon = values == epsilons;
     for (size_t k = 0; k < METHODS; k++) {
         const method *m = &methods[k];
         if ((values == alphas && !m->by_alpha) || (values == budgets && !m->by_steps)) { continue; }
         if ((m->dense || m->half) && !w->subject.shape) { continue; }
         if (m->warm && !w->subject.code_size) { continue; }
         if (m->half && !w->halves[m->half == DIST_HALF_BF16].shape) {
-            if (!epsilon) { printf("%s,%s,not available,,%d%s\n", w->subject.s->name, m->name, w->camera.width, EMPTY); }
+            if (values == epsilons) { continue; }
+            printf("%s,%s,not available,,%d%s\n", w->subject.s->name, m->name, w->camera.width, EMPTY);
             continue;
         }
         for (size_t i = 0; i < count; i += w->quick ? 2 : 1) { add_row(w, m, parameter, values[i]); }

@@ -2,11 +2,12 @@
 # Bytes of code and constants of the implementation for each DIST_NO_ switch, at -Os: csv. From the root of the
 # repository. A compiler that is not installed, or lacks the C library's headers, is left out with a word on stderr.
 #
-#   sh bench/code_size.sh
+#   sh bench/code_size.sh [--quick]      quick: x86-64, nothing and all left out
 
 work=$(mktemp -d) || exit 1
 trap 'rm -rf "$work"' EXIT
 printf '#define DIST_IMPLEMENTATION\n#include "dist.h"\n' >"$work/dist.c"
+[ "$1" = --quick ] && quick=1
 switches=$(sed -n '/^   Options/,/^$/p' dist.h | grep -o 'DIST_NO_[A-Z_]*' | sort -u)
 
 # bytes COMMAND...: text and data of the object file
@@ -25,8 +26,9 @@ table() {
     echo "$name,none,$all,0"
     together=
     for switch in $switches; do
-        left=$(bytes "$@" "-D$switch")
         together="$together -D$switch"
+        [ -z "$quick" ] || continue
+        left=$(bytes "$@" "-D$switch")
         echo "$name,$switch,$left,$((all - left))"
     done
     left=$(bytes "$@" $together)
@@ -35,5 +37,6 @@ table() {
 
 echo "target,left out,bytes,saved"
 table x86-64 "${CC:-cc}"
+[ -z "$quick" ] || exit 0
 table cortex-m4 arm-none-eabi-gcc -mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16
 table cortex-m7 arm-none-eabi-gcc -mcpu=cortex-m7 -mthumb -mfloat-abi=hard -mfpu=fpv5-d16

@@ -110,6 +110,18 @@ static inline void results_close(const results *r, FILE *file, const char *name,
     fflush(stdout);
 }
 
+/* This thread's processor time, so that what else the machine does counts for little. */
+static inline double thread_seconds(void)
+{
+#ifdef CLOCK_THREAD_CPUTIME_ID
+    struct timespec t;
+    clock_gettime(CLOCK_THREAD_CPUTIME_ID, &t);
+    return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
+#else
+    return seconds_now();
+#endif
+}
+
 /* The middle of n values, of an even number the mean of the two in the middle; sorts them. */
 static inline double results_median(size_t n, double *values)
 {

@@ -113,18 +113,6 @@ static void run_jobs(const bench *b, const char *what, int count, job_fn job, vo
     progress_end(&p);
 }
 
-/* This thread's processor time, so that what else the machine does counts for little. */
-static double thread_seconds(void)
-{
-#ifdef CLOCK_THREAD_CPUTIME_ID
-    struct timespec t;
-    clock_gettime(CLOCK_THREAD_CPUTIME_ID, &t);
-    return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
-#else
-    return seconds_now();
-#endif
-}
-
 /* ---- what is seen ------------------------------------------------------------------------------------------------ */
 
 /* One shape of a family, one picture of it, and points all over its true surface. */
@@ -1029,7 +1017,8 @@ static void curves(const bench *b)
     fprintf(f,
             "The paper's rows, each with all before it, and our tracer; all with the paper's gradient (K = 1), dense"
             " depth and\nsilhouette, %d held-out shapes, %d x %d pixels. Loss: depth and silhouette, weighted; "
-            "geometric means.\n\n"
+            "geometric means. The paper shows\nsuch curves, and the loss against the Chamfer distance, in a figure "
+            "without numbers, of a shape and a decoder of its own.\n\n"
             "| | loss at the start | after %d steps | after %d | Chamfer x 1000 at the end | queries, millions | "
             "processor seconds |\n|---|---|---|---|---|---|---|\n",
             v.problems, v.size, v.size, b->s.iterations / 4, b->s.iterations - 1);
@@ -1111,7 +1100,8 @@ static void gradients(const bench *b)
     fprintf(f,
             "%d held-out shapes, dense depth and silhouette, %d x %d pixels, our tracer without warm start. For each "
             "Chamfer distance\nx 1000: fits that reach it within %d steps; of all fits the median step, queries and "
-            "processor seconds at which they do\n(none: half of them or more do not). At the end: geometric mean.\n\n"
+            "processor seconds at which they do\n(none: half of them or more do not). At the end: geometric mean. "
+            "The paper has K, without a number for it.\n\n"
             "| |",
             v.problems, v.size, v.size, b->s.iterations);
     for (int g = 0; g < 3; g++) {

@@ -25,6 +25,9 @@ columns marching_holes shape,alpha,tracer,resolution,hits,holes
 columns threshold tracer,epsilon,resolution,pixels,dilation,erosion
 columns photos part,family,target,seed,level,method,width,views,iterations,chamfer1000_start,chamfer1000_end
 columns pose degrees_start,distance_start,trial,shape,method,degrees_end,distance_end,found,explained
+columns needs need,size,rays,queries,backward
+columns code_size 'target,left out,bytes,saved'
+columns work_precision case,method,parameter,value,resolution,queries,queries_per_pixel
 columns pose_curve method,degrees_start,step,degrees_quarter,degrees_median
 
 for name in ladder marching threshold photos pose completion; do

@@ -72,9 +72,9 @@ if [ -n "$quick" ]; then
     shown="embedded_5_64"
 else
     rm -f build/work_precision/*.svg
-    csv work_precision build/bench_work_precision --size 256 --minutes 0.5 --svg build/work_precision/q
+    csv work_precision build/bench_work_precision --size 128 --minutes 1 --svg build/work_precision/q
     cp build/work_precision/q_losses.svg "$folder/work_precision_losses.svg" || exit 1
-    shown="torus_grazing_256 rods_1e-3_256 embedded_5_256 mug_256"
+    shown="torus_grazing_128 rods_1e-3_128 embedded_5_128 mug_128"
 fi
 for name in $shown; do
     plot=build/work_precision/q_$name.svg

@@ -1554,8 +1554,26 @@ typedef struct disti_gemm_weights {
     int out, rows, columns;
 } disti_gemm_weights;
 
+/* Sums over the rows listed, for every output o: sum[0..3][o] = sum_i weights(o, list[i]) model[i][0..3] and
+   sum[4][o] = sum_i |weights(o, list[i])| model[i][4]; sum is (5, stride), stride at least out rounded up to 8. */
+typedef struct disti_bound {
+    const float *weights;
+    const int *list;
+    const float *model; /* (count, 8) */
+    float *sum;
+    size_t stride;
+    int rows, count, out;
+} disti_bound;
+
 typedef struct disti_kernels {
     void (*gemm)(const disti_gemm *g);
+    void (*bound)(const disti_bound *g);
+    /* top[o] = the largest of sum[1..3][o] . c + |sum[1..3][o]| . h over `cells` boxes (center c, half extents h) */
+    void (*top)(size_t out, const float *sum, size_t stride, int cells, const float *cell, float *top);
+    /* least and largest of x - slope . d over the lanes of several blocks; their number is a multiple of 16 but in the
+       last block the first `columns` count, likewise. d (blocks, 3, B), x (blocks, stride) */
+    void (*fit)(int blocks, int columns, const float *x, size_t stride, const float *d, const float *slope, float *least,
+                float *most);
     void (*gemm_back)(const disti_gemm_back *g);
     void (*gemm_weights)(const disti_gemm_weights *g);
     /* y[c] = bias + sum_k w[k] x[k][c], c < DISTI_BLOCK, over alive rows (NULL: all): the last layer's single output */
@@ -1891,6 +1909,59 @@ static void disti_relu_scalar(size_t rows, float *y, uint64_t *mask)
     }
 }
 
+static void disti_bound_scalar(const disti_bound *g)
+{
+    for (int o = 0; o < (g->out + 7) / 8 * 8; o++) {
+        const float *w = g->weights + (size_t)(o / 8) * (size_t)g->rows * 8 + o % 8;
+        float s[5] = {0, 0, 0, 0, 0};
+        for (int i = 0; i < g->count; i++) {
+            const float v = w[(size_t)g->list[i] * 8], *m = g->model + (size_t)i * 8;
+            for (int j = 0; j < 4; j++) s[j] += v * m[j];
+            s[4] += (v < 0.0f ? -v : v) * m[4];
+        }
+        for (size_t j = 0; j < 5; j++) g->sum[j * g->stride + (size_t)o] = s[j];
+    }
+}
+
+DISTI_INLINE void disti_top(size_t out, const float *DISTI_RESTRICT sum, size_t stride, int cells,
+                            const float *DISTI_RESTRICT cell, float *DISTI_RESTRICT top)
+{
+    const float *x = sum + stride, *y = x + stride, *z = y + stride;
+    for (size_t o = 0; o < out; o++) top[o] = -3e38f;
+    for (int i = 0; i < cells; i++, cell += 6) {
+        for (size_t o = 0; o < out; o++) {
+            float t = x[o] * cell[0] + y[o] * cell[1] + z[o] * cell[2] + fabsf(x[o]) * cell[3] + fabsf(y[o]) * cell[4] +
+                      fabsf(z[o]) * cell[5];
+            top[o] = t > top[o] ? t : top[o];
+        }
+    }
+}
+
+DISTI_INLINE void disti_fit(int blocks, int columns, const float *DISTI_RESTRICT x, size_t stride,
+                            const float *DISTI_RESTRICT d, const float *DISTI_RESTRICT slope, float *least, float *most)
+{
+    float low[16], high[16];
+    const float u = slope[0], v = slope[1], w = slope[2];
+    for (size_t c = 0; c < 16; c++) low[c] = 3e38f, high[c] = -3e38f;
+    for (int b = 0; b < blocks; b++, x += stride, d += 3 * DISTI_BLOCK) {
+        const size_t end = (size_t)(b + 1 < blocks ? (int)DISTI_BLOCK : columns);
+        for (size_t at = 0; at < end; at += 16) {
+            for (size_t c = 0; c < 16; c++) {
+                const float *p = d + at + c;
+                float r = x[at + c] - (u * p[0] + v * p[DISTI_BLOCK] + w * p[2 * DISTI_BLOCK]);
+                low[c] = r < low[c] ? r : low[c];
+                high[c] = r > high[c] ? r : high[c];
+            }
+        }
+    }
+    *least = low[0];
+    *most = high[0];
+    for (int c = 1; c < 16; c++) {
+        *least = DISTI_MIN(*least, low[c]);
+        *most = DISTI_MAX(*most, high[c]);
+    }
+}
+
 /* These of a block from the same text for every instruction set; scalar is the definition, as above. */
 #define DISTI_PLAIN(isa, function)                                                                                     \
     function void disti_activate_##isa(int activation, float scale, size_t n, float *y, float *slope)                  \
@@ -1906,6 +1977,16 @@ static void disti_relu_scalar(size_t rows, float *y, uint64_t *mask)
                                          const float *inverse, float *d)                                               \
     {                                                                                                                  \
         disti_norm_backward(units, gamma, half, hat, inverse, d);                                                      \
+    }                                                                                                                  \
+    function void disti_top_##isa(size_t out, const float *sum, size_t stride, int cells, const float *cell,           \
+                                   float *top)                                                                         \
+    {                                                                                                                  \
+        disti_top(out, sum, stride, cells, cell, top);                                                                 \
+    }                                                                                                                  \
+    function void disti_fit_##isa(int blocks, int columns, const float *x, size_t stride, const float *d,              \
+                                   const float *slope, float *least, float *most)                                      \
+    {                                                                                                                  \
+        disti_fit(blocks, columns, x, stride, d, slope, least, most);                                                  \
     }
 DISTI_PLAIN(scalar, static)
 
@@ -2216,6 +2297,35 @@ DISTI_PLAIN(scalar, static)
         }                                                                                                              \
     }
 
+/* Two vectors of outputs at a time: of two panels, or of one where a vector is half a panel. */
+#define DISTI_BOUND1(j)                                                                                                \
+    { const DISTI_VEC b = DISTI_SET1(m[j]); a0##j = DISTI_FMA(b, v, a0##j); a1##j = DISTI_FMA(b, w, a1##j); }
+#define DISTI_BOUND_ZERO(j) DISTI_VEC a0##j = DISTI_SET1(0.0f), a1##j = DISTI_SET1(0.0f);
+#define DISTI_BOUND_STORE(j) DISTI_STORE(s + j * g->stride, a0##j); DISTI_STORE(t + j * g->stride, a1##j);
+#define DISTI_BOUND(isa)                                                                                               \
+    DISTI_NOINLINE DISTI_FUNCTION void disti_bound_##isa(const disti_bound *g)                                         \
+    {                                                                                                                  \
+        const int panels = (g->out + 7) / 8;                                                                           \
+        const size_t panel = (size_t)g->rows * 8;                                                                      \
+        for (int p = 0; p < panels; p += DISTI_LANES / 4) {                                                            \
+            const size_t other = (size_t)(unsigned)(DISTI_LANES == 8 ? DISTI_MIN(p + 1, panels - 1) : p);              \
+            const size_t half = DISTI_LANES == 8 ? 0 : 4;                                                              \
+            const float *w0 = g->weights + (size_t)(unsigned)p * panel, *w1 = g->weights + other * panel + half;       \
+            const float *m = g->model;                                                                                 \
+            float *s = g->sum + (size_t)(unsigned)p * 8, *t = g->sum + other * 8 + half;                               \
+            DISTI_BOUND_ZERO(0) DISTI_BOUND_ZERO(1) DISTI_BOUND_ZERO(2) DISTI_BOUND_ZERO(3) DISTI_BOUND_ZERO(4)        \
+            for (const int *k = g->list, *end = k + g->count; k < end; k++, m += 8) {                                  \
+                DISTI_VEC v = DISTI_LOAD(w0 + (size_t)(unsigned)*k * 8);                                               \
+                DISTI_VEC w = DISTI_LOAD(w1 + (size_t)(unsigned)*k * 8);                                               \
+                DISTI_BOUND1(0) DISTI_BOUND1(1) DISTI_BOUND1(2) DISTI_BOUND1(3)                                        \
+                v = DISTI_ABS(v);                                                                                      \
+                w = DISTI_ABS(w);                                                                                      \
+                DISTI_BOUND1(4)                                                                                        \
+            }                                                                                                          \
+            DISTI_BOUND_STORE(0) DISTI_BOUND_STORE(1) DISTI_BOUND_STORE(2) DISTI_BOUND_STORE(3) DISTI_BOUND_STORE(4)   \
+        }                                                                                                              \
+    }
+
 #define DISTI_KERNELS(isa, R, W)                                                                                       \
     DISTI_GEMM_TILE(wide_##isa, R, W)                                                                                  \
     DISTI_GEMM_TILE(middle_##isa, 8, 2)                                                                                \
@@ -2263,6 +2373,9 @@ DISTI_FUNCTION __m128 disti_keep_sse2(__m128 v, int bits)
 }
 #define DISTI_DEPTH 112
 DISTI_KERNELS(sse2, 4, 2)
+#define DISTI_ABS(v) _mm_andnot_ps(_mm_set1_ps(-0.0f), v)
+DISTI_BOUND(sse2)
+#undef DISTI_ABS
 #undef DISTI_FUNCTION
 #undef DISTI_VEC
 #undef DISTI_LANES
@@ -2301,6 +2414,9 @@ DISTI_FUNCTION __m256 disti_keep_avx2(__m256 v, int bits)
 }
 #define DISTI_DEPTH 112
 DISTI_KERNELS(avx2, 4, 3)
+#define DISTI_ABS(v) _mm256_andnot_ps(_mm256_set1_ps(-0.0f), v)
+DISTI_BOUND(avx2)
+#undef DISTI_ABS
 #undef DISTI_FUNCTION
 #undef DISTI_VEC
 #undef DISTI_LANES
@@ -2556,6 +2672,9 @@ static float32x4_t disti_keep_neon(float32x4_t v, uint32_t bits)
 }
 #define DISTI_DEPTH 112
 DISTI_KERNELS(neon, 8, 3)
+#define DISTI_ABS(v) vabsq_f32(v)
+DISTI_BOUND(neon)
+#undef DISTI_ABS
 #endif
 #endif
 
@@ -2580,6 +2699,8 @@ static uint32_t disti_f16_bits(float x) /* not called: dist_net_set_half refuses
     kernels.outer = disti_outer_##isa; \
     kernels.relu = disti_relu_##isa; \
     kernels.activate = disti_activate_##isa; \
+    kernels.top = disti_top_##isa; \
+    kernels.fit = disti_fit_##isa; \
     kernels.norm = disti_norm_##isa; \
     kernels.norm_back = disti_norm_back_##isa;
 
@@ -2588,13 +2709,16 @@ static disti_kernels disti_kernels_for(int isa)
 {
     disti_kernels kernels;
     DISTI_TABLE(scalar)
+    kernels.bound = disti_bound_scalar;
 #ifdef DISTI_X86
     if (isa == DIST_ISA_SSE2) { DISTI_TABLE(sse2) }
     if (isa == DIST_ISA_AVX2) { DISTI_TABLE(avx2) }
     if (isa == DIST_ISA_AVX512) { DISTI_TABLE(avx512) }
+    if (isa == DIST_ISA_SSE2) kernels.bound = disti_bound_sse2;
+    if (isa == DIST_ISA_AVX2 || isa == DIST_ISA_AVX512) kernels.bound = disti_bound_avx2;
 #endif
 #ifdef DISTI_NEON
-    if (isa == DIST_ISA_NEON) { DISTI_TABLE(neon) }
+    if (isa == DIST_ISA_NEON) { DISTI_TABLE(neon) kernels.bound = disti_bound_neon; }
 #endif
     (void)isa;
     return kernels;
@@ -2648,6 +2772,10 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_EACH
 #undef DISTI_DRIVERS
 #undef DISTI_KERNELS
+#undef DISTI_BOUND
+#undef DISTI_BOUND1
+#undef DISTI_BOUND_ZERO
+#undef DISTI_BOUND_STORE
 #undef DISTI_PREFETCH
 #undef DISTI_FUNCTION
 #undef DISTI_VEC
@@ -4945,6 +5073,7 @@ struct dist_shape {
     float *bias; /* (layers + 1, max_rows): each layer's bias with the code folded in; then zeros, for tangents */
     float lipschitz, lipschitz_far;
     float half_error; /* largest of 16 bits at the samples of disti_shape_slope */
+    int groups;          /* disti_net_groups */
     uint32_t all_alive; /* bit l: the samples of disti_shape_slope met no dead unit at layer l's input */
     dist_shape *texture; /* the net that colors it, with [code, color code] folded in; NULL: none */
     size_t store_block_size; /* of activations and deltas, for weight gradients; ctx->store holds store_blocks */
@@ -4971,6 +5100,7 @@ typedef struct disti_block {
     int values; /* no reverse pass follows: masks and slopes need not be kept */
     int channel, channels; /* the output's channels that the reverse pass starts from: the distance, or r, g, b */
     int half; /* 0; or B / 2: lane c + half is the tangent of lane c, see disti_second_block */
+    const float *last; /* the output channel's weights for the rows at hand; NULL: as the net has them */
 } disti_block;
 
 /* Returns the bytes needed; base NULL: only that. Sizes are bounded by 32 layers of 8192 + 99 rows. */
@@ -5277,8 +5407,8 @@ static void disti_net_output(const dist_shape *shape, const disti_block *b, cons
     disti_kernels kernels = disti_kernels_for(shape->ctx->isa);
     const int *alive = b->alive_count[l] < rows ? b->alive + (size_t)l * (size_t)net->max_rows : NULL;
     float bias = shape->bias[(size_t)l * (size_t)net->max_rows + (size_t)channel];
-    kernels.dot(net->panels + layer->panel + (size_t)channel * (size_t)rows, b->half ? 0.0f : bias, x, alive,
-                b->alive_count[l], rows, b->columns, value);
+    const float *w = b->last ? b->last : net->panels + layer->panel + (size_t)channel * (size_t)rows;
+    kernels.dot(w, b->half ? 0.0f : bias, x, alive, b->alive_count[l], rows, b->columns, value);
     float v[DISTI_BLOCK], d[DISTI_BLOCK], t[DISTI_BLOCK], bend[DISTI_BLOCK];
     float level = channel == net->sdf_channel ? net->level : 0.0f;
     int twice = net->output == DISTI_OUTPUT_TANH_TWICE;
@@ -5701,10 +5831,364 @@ static void disti_wide_eval(const dist_shape *shape, int worker, size_t n, const
     disti_counter_of(shape->ctx, worker)->done += (double)dist_net_operations(net, 1) * (double)n;
 }
 
+/* Rows left out, too. A unit's pre-activation a(p) = b + sum_k w_k x_k(p) over a group of neighboring points is bounded
+   from what the layer's inputs were there: with x_k(p) = A_k + J_k . (p - c) + e_k(p), |e_k| <= E_k, where J_k is
+   whatever seems right and A_k and E_k are then the middle and half the range of x_k - J_k . (p - c) over the group,
+
+     a(p) <= b + sum_k w_k A_k + max_p (sum_k w_k J_k) . (p - c) + sum_k |w_k| E_k
+
+   The bound asks nothing of the layers before, whose outputs are known, so it does not loosen with depth. It costs five
+   columns for the whole group; the maximum is taken over boxes around a dozen points each. A unit for which it is
+   negative is dead over the group and is not computed; rounding, of the sums here and of those left out, each at most
+   2 (K + 4) 2^-24 times the sum of the magnitudes of its K terms, is in E_k. So no bit of any result changes.
+   J of a unit that is alive all over the group is sum_k w_k J_k; of one that changes sign, half of it.
+   The weights of the units that are left are packed for the group, which its four blocks then share. */
+enum {
+    DISTI_GROUP = 4,
+    DISTI_GROUP_POINTS = (int)DISTI_GROUP * DISTI_BLOCK,
+    DISTI_CELL_POINTS = 12,
+    DISTI_CELLS = (int)DISTI_GROUP_POINTS / DISTI_CELL_POINTS,
+    DISTI_SORTED = 8 * (int)DISTI_GROUP_POINTS /* points put in order at once */
+};
+
+typedef struct disti_group {
+    float *x[2];     /* (GROUP, max_rows, B): a layer's input: rows of the units that are computed, then the point's */
+    float *point, *away; /* (GROUP, 3, B): the points, and from the group's center */
+    float *panels, *bias; /* (max_rows, max_rows), max_rows: packed */
+    float *model;    /* (max_rows, 8): A, J, E of the rows in `list` */
+    float *sum;      /* (5, max_rows): of each output, see disti_bound; its row 0 then has the bound */
+    float *top;      /* max_rows */
+    uint64_t *mask;  /* (GROUP, max_rows) */
+    int *alive;      /* (GROUP, max_rows): rows of x alive in the block */
+    int *unit[2];    /* (max_rows): which unit each row of x is */
+    int *list;       /* (max_rows): columns of the layer's weights for rows alive in any block */
+    int *place;      /* and these rows */
+    int *order;      /* DISTI_SORTED */
+    float *points;   /* (GROUP_POINTS, 3), in that order */
+    float cell[6 * DISTI_CELLS], center[3], half[3];
+    int alive_count[DISTI_GROUP];
+    int blocks, columns, cells, count; /* columns: of the last block, up to a multiple of 16; count: of list */
+} disti_group;
+
+/* Returns the bytes needed, as disti_block_layout does. */
+static size_t disti_group_layout(const dist_net *net, unsigned char *base, disti_group *g)
+{
+    size_t at = 0, rows = (size_t)net->max_rows, row = DISTI_BLOCK * sizeof(float);
+    memset(g, 0, sizeof *g);
+    for (int i = 0; i < 2; i++) {
+        g->x[i] = (float *)disti_take(base, &at, DISTI_GROUP * rows, row);
+        g->unit[i] = (int *)disti_take(base, &at, rows, sizeof(int));
+    }
+    g->point = (float *)disti_take(base, &at, DISTI_GROUP * 3, row);
+    g->away = (float *)disti_take(base, &at, DISTI_GROUP * 3, row);
+    g->panels = (float *)disti_take(base, &at, rows * rows, sizeof(float));
+    g->bias = (float *)disti_take(base, &at, rows, sizeof(float));
+    g->model = (float *)disti_take(base, &at, rows * 8, sizeof(float));
+    g->sum = (float *)disti_take(base, &at, rows * 5, sizeof(float));
+    g->top = (float *)disti_take(base, &at, rows, sizeof(float));
+    g->mask = (uint64_t *)disti_take(base, &at, DISTI_GROUP * rows, sizeof(uint64_t));
+    g->alive = (int *)disti_take(base, &at, DISTI_GROUP * rows, sizeof(int));
+    g->list = (int *)disti_take(base, &at, rows, sizeof(int));
+    g->place = (int *)disti_take(base, &at, rows, sizeof(int));
+    g->order = (int *)disti_take(base, &at, DISTI_SORTED, sizeof(int));
+    g->points = (float *)disti_take(base, &at, DISTI_GROUP_POINTS * 3, sizeof(float));
+    return at;
+}
+
+/* Whether it is tried: wide nets of units that can be dead and of inputs that are the point itself. */
+static int disti_net_groups(const dist_context *ctx, const dist_net *net)
+{
+    int narrow = net->max_rows, widest = net->max_rows;
+    for (int l = 0; l + 1 < net->layers; l++) narrow = DISTI_MIN(narrow, net->layer[l].out);
+    return net->activation == DIST_ACTIVATION_RELU && !net->normed && net->levels == 0 && net->layers > 2 &&
+           narrow >= 96 && widest <= 1100 && (!ctx->blas.sgemm_fn || narrow < ctx->blas_width);
+}
+
+/* Puts order[begin..end-1] such that neighbors stand together: cut across the longest side of their box, in whole
+   groups, blocks, cells. */
+static void disti_sort_points(const float *points, int *order, int begin, int end)
+{
+    while (end - begin > DISTI_CELL_POINTS) {
+        float low[3] = {3e38f, 3e38f, 3e38f}, high[3] = {-3e38f, -3e38f, -3e38f};
+        int n = end - begin, axis = 0;
+        int unit = n > DISTI_GROUP_POINTS ? (int)DISTI_GROUP_POINTS
+                   : n > DISTI_BLOCK      ? (int)DISTI_BLOCK
+                                          : (int)DISTI_CELL_POINTS;
+        for (int i = begin; i < end; i++) {
+            for (int k = 0; k < 3; k++) {
+                float x = points[3 * order[i] + k];
+                low[k] = DISTI_MIN(low[k], x);
+                high[k] = DISTI_MAX(high[k], x);
+            }
+        }
+        for (int k = 1; k < 3; k++) axis = high[k] - low[k] > high[axis] - low[axis] ? k : axis;
+        int middle = begin + (n / unit + 1) / 2 * unit, a = begin, b = end - 1;
+        if (middle >= end) middle = end - unit;
+        while (a < b) { /* Hoare's selection of the element at `middle` */
+            float pivot = points[3 * order[(a + b) / 2] + axis];
+            int i = a, j = b;
+            while (i <= j) {
+                while (points[3 * order[i] + axis] < pivot) i++;
+                while (points[3 * order[j] + axis] > pivot) j--;
+                if (i > j) break;
+                int swap = order[i];
+                order[i++] = order[j];
+                order[j--] = swap;
+            }
+            if (middle <= j) b = j;
+            else if (middle >= i) a = i;
+            else break;
+        }
+        disti_sort_points(points, order, begin, middle);
+        begin = middle;
+    }
+}
+
+/* Makes the group of n points (n, 3) ready: their rows, idle lanes repeating the last point, and their boxes. */
+static void disti_group_begin(disti_group *g, int n, const float *points)
+{
+    float low[3] = {3e38f, 3e38f, 3e38f}, high[3] = {-3e38f, -3e38f, -3e38f};
+    g->blocks = (n + DISTI_BLOCK - 1) / DISTI_BLOCK;
+    g->columns = (n - (g->blocks - 1) * DISTI_BLOCK + 15) / 16 * 16;
+    g->cells = (n + DISTI_CELL_POINTS - 1) / DISTI_CELL_POINTS;
+    for (int i = 0; i < 3 * n; i++) {
+        low[i % 3] = DISTI_MIN(low[i % 3], points[i]);
+        high[i % 3] = DISTI_MAX(high[i % 3], points[i]);
+    }
+    for (int k = 0; k < 3; k++) {
+        g->center[k] = 0.5f * (low[k] + high[k]);
+        g->half[k] = 0.50001f * (high[k] - low[k]);
+        for (int i = 0; i < g->blocks * DISTI_BLOCK; i++) {
+            size_t at = (size_t)(i / DISTI_BLOCK * 3 + k) * DISTI_BLOCK + (size_t)(i % DISTI_BLOCK);
+            g->point[at] = points[3 * DISTI_MIN(i, n - 1) + k];
+            g->away[at] = g->point[at] - g->center[k];
+        }
+        for (int i = 0; i < g->cells; i++) {
+            float least = 3e38f, most = -3e38f;
+            for (int j = i * DISTI_CELL_POINTS; j < DISTI_MIN((i + 1) * DISTI_CELL_POINTS, n); j++) {
+                float away = points[3 * j + k] - g->center[k];
+                least = DISTI_MIN(least, away);
+                most = DISTI_MAX(most, away);
+            }
+            g->cell[6 * i + k] = 0.5f * (least + most);
+            g->cell[6 * i + 3 + k] = 0.50001f * (most - least);
+        }
+    }
+}
+
+/* One row of the input, as it stands over the group, to the model's next entry: column `column` of the weights, row
+   `place` of x. slack: what rounding may add, relative. */
+static void disti_group_model(disti_group *g, int column, int place, const float slope[3], float least, float most,
+                              float slack)
+{
+    float *m = g->model + (size_t)g->count * 8, middle = 0.5f * (least + most), reach = 0.0f;
+    g->list[g->count] = column;
+    g->place[g->count++] = place;
+    m[0] = middle;
+    for (int k = 0; k < 3; k++) {
+        m[1 + k] = slope[k];
+        reach += (slope[k] < 0.0f ? -slope[k] : slope[k]) * (g->half[k] + (g->center[k] < 0 ? -g->center[k] : g->center[k]));
+    }
+    float range = DISTI_MAX(most - middle, middle - least);
+    m[4] = range + slack * (range + reach + (middle < 0.0f ? -middle : middle));
+}
+
+/* Layer l's units that may be alive, to unit: those whose bound is not negative. Returns how many. */
+static int disti_group_units(const dist_shape *shape, const disti_kernels *kernels, disti_group *g, int l, float slack,
+                             int *unit)
+{
+    const dist_net *net = shape->net;
+    const disti_linear *layer = &net->layer[l];
+    const float *bias = shape->bias + (size_t)l * (size_t)net->max_rows;
+    size_t out = (size_t)layer->out, stride = (size_t)net->max_rows;
+    disti_bound bound;
+    int count = 0;
+    bound.weights = net->panels + layer->panel;
+    bound.list = g->list;
+    bound.model = g->model;
+    bound.sum = g->sum;
+    bound.stride = stride;
+    bound.rows = layer->prev + layer->point;
+    bound.count = g->count;
+    bound.out = layer->out;
+    kernels->bound(&bound);
+    kernels->top(out, g->sum, stride, g->cells, g->cell, g->top);
+    for (size_t o = 0; o < out; o++) {
+        float most = g->sum[o] + bias[o] + g->top[o] + g->sum[4 * stride + o] + slack * fabsf(bias[o]);
+        unit[count] = (int)o;
+        count += !(most < 0.0f && disti_finite(most)); /* what is not finite comes out as without */
+    }
+    return count;
+}
+
+/* The weights of those `out` units for the rows in g->list, and their biases: panels for g->place's rows of x. */
+static void disti_group_pack(const dist_shape *shape, disti_group *g, int l, int rows, int out, const int *unit)
+{
+    const dist_net *net = shape->net;
+    const disti_linear *layer = &net->layer[l];
+    size_t panel = (size_t)(layer->prev + layer->point) * 8;
+    for (int o = 0; o < out; o += 8) {
+        const float *from[8];
+        float *to = g->panels + (size_t)o * (size_t)rows;
+        for (int i = 0; i < 8; i++) {
+            size_t u = (size_t)unit[DISTI_MIN(o + i, out - 1)];
+            from[i] = net->panels + layer->panel + u / 8 * panel + u % 8;
+            g->bias[o + i] = shape->bias[(size_t)l * (size_t)net->max_rows + u];
+        }
+        for (int j = 0; j < g->count; j++) {
+            const size_t k = (size_t)g->list[j] * 8;
+            float *row = to + (size_t)g->place[j] * 8;
+            row[0] = from[0][k];
+            row[1] = from[1][k];
+            row[2] = from[2][k];
+            row[3] = from[3][k];
+            row[4] = from[4][k];
+            row[5] = from[5][k];
+            row[6] = from[6][k];
+            row[7] = from[7][k];
+        }
+    }
+}
+
+/* Hidden layer l of the group's blocks: x, `rows` rows of it, to y's `out`. */
+static void disti_group_layer(const dist_shape *shape, const disti_kernels *kernels, disti_group *g, int l, int rows,
+                              int out)
+{
+    const dist_net *net = shape->net;
+    size_t width = (size_t)net->max_rows;
+    disti_gemm m;
+    m.weights = g->panels;
+    m.bias = g->bias;
+    m.rows = rows;
+    m.out = out;
+    m.relu = 1;
+    for (int j = 0; j < g->blocks; j++) {
+        m.x = g->x[l & 1] + (size_t)j * width * DISTI_BLOCK;
+        m.y = g->x[(l + 1) & 1] + (size_t)j * width * DISTI_BLOCK;
+        m.alive = g->alive + (size_t)j * width;
+        m.alive_count = g->alive_count[j];
+        m.mask = g->mask + (size_t)j * width;
+        m.columns = j + 1 < g->blocks ? (int)DISTI_BLOCK : g->columns;
+        kernels->gemm(&m);
+    }
+}
+
+/* The input rows of layer l: the point's at the end of the `units` there are, the lists of what is alive, the model. */
+static void disti_group_input(const dist_shape *shape, const disti_kernels *kernels, disti_group *g, int l, int units,
+                              float slack)
+{
+    const dist_net *net = shape->net;
+    const disti_linear *layer = &net->layer[l];
+    size_t width = (size_t)net->max_rows, stride = width * DISTI_BLOCK;
+    const int *unit = g->unit[l & 1];
+    float *x = g->x[l & 1];
+    g->count = 0;
+    for (int j = 0; j < g->blocks; j++) {
+        int *alive = g->alive + (size_t)j * width, count = 0;
+        const uint64_t *mask = g->mask + (size_t)j * width;
+        for (int u = 0; u < units; u++) {
+            alive[count] = u;
+            count += mask[u] != 0;
+        }
+        for (int i = 0; i < layer->point; i++) alive[count++] = units + i;
+        g->alive_count[j] = count;
+        memcpy(x + (size_t)j * stride + (size_t)units * DISTI_BLOCK, g->point + (size_t)j * 3 * DISTI_BLOCK,
+               (size_t)layer->point * DISTI_BLOCK * sizeof(float));
+    }
+    for (int u = 0; u < units; u++) {
+        uint64_t any = 0, all = ((uint64_t)1 << DISTI_BLOCK) - 1;
+        for (int j = 0; j < g->blocks; j++) {
+            uint64_t mask = g->mask[(size_t)j * width + (size_t)u];
+            any |= mask;
+            all &= j + 1 < g->blocks ? mask : mask | ~(uint64_t)0 << g->columns;
+        }
+        if (!any) continue;
+        float slope[3], least, most, share = all == ((uint64_t)1 << DISTI_BLOCK) - 1 ? 1.0f : 0.5f;
+        for (size_t k = 0; k < 3; k++) slope[k] = share * g->sum[(1 + k) * width + (size_t)unit[u]];
+        kernels->fit(g->blocks, g->columns, x + (size_t)u * DISTI_BLOCK, stride, g->away, slope, &least, &most);
+        disti_group_model(g, unit[u], u, slope, least, most, slack);
+    }
+    for (int i = 0; i < layer->point; i++) {
+        float slope[3] = {0, 0, 0};
+        slope[i] = 1.0f;
+        disti_group_model(g, layer->prev + i, units + i, slope, g->center[i], g->center[i], slack);
+    }
+}
+
+/* f at a group of points. 0: hardly a unit is dead over all of it: not done. */
+static int disti_group_eval(const dist_shape *shape, int worker, disti_group *g, disti_block *b, int n,
+                            const float *points, float *sdf)
+{
+    const dist_net *net = shape->net;
+    disti_kernels kernels = disti_kernels_for(shape->ctx->isa);
+    disti_counter *counter = disti_counter_of(shape->ctx, worker);
+    int units = 0, last = net->layers - 1;
+    float slack = 5e-7f * (float)(net->max_rows + 16); /* twice 4 (K + 4) 2^-24 */
+    double done = 0.0;
+    size_t width = (size_t)net->max_rows;
+    disti_group_begin(g, n, points);
+    disti_group_input(shape, &kernels, g, 0, 0, slack);
+    for (int l = 0; l < last; l++) {
+        const disti_linear *layer = &net->layer[l];
+        int *unit = g->unit[(l + 1) & 1], rows = units + layer->point;
+        units = disti_group_units(shape, &kernels, g, l, slack, unit);
+        if (l == 1 && 4 * units > 3 * layer->out) return 0;
+        disti_group_pack(shape, g, l, rows, units, unit);
+        disti_group_layer(shape, &kernels, g, l, rows, units);
+        done += 5.0 * (double)g->count * layer->out;
+        for (int j = 0; j < g->blocks; j++) {
+            int columns = DISTI_MIN(n - j * DISTI_BLOCK, (int)DISTI_BLOCK);
+            done += (double)g->alive_count[j] * (double)units * (double)columns;
+        }
+        disti_group_input(shape, &kernels, g, l + 1, units, slack);
+    }
+    const disti_linear *layer = &net->layer[last];
+    const float *w = net->panels + layer->panel + (size_t)net->sdf_channel * (size_t)(layer->prev + layer->point);
+    for (int j = 0; j < g->count; j++) g->panels[g->place[j]] = w[g->list[j]];
+    b->last = g->panels;
+    b->values = 1;
+    for (int j = 0; j < g->blocks; j++) {
+        b->columns = DISTI_MIN(n - j * DISTI_BLOCK, (int)DISTI_BLOCK);
+        b->alive_count[last] = g->alive_count[j];
+        memcpy(b->alive + (size_t)last * width, g->alive + (size_t)j * width, (size_t)g->alive_count[j] * sizeof(int));
+        disti_net_output(shape, b, g->x[last & 1] + (size_t)j * width * DISTI_BLOCK, net->sdf_channel, b->tail,
+                         b->tail + DISTI_BLOCK, NULL);
+        memcpy(sdf + j * DISTI_BLOCK, b->tail, (size_t)b->columns * sizeof(float));
+        done += (double)g->alive_count[j] * (double)b->columns;
+    }
+    counter->done += done;
+    counter->dense += (double)dist_net_operations(net, 1) * (double)n;
+    return 1;
+}
+
+/* f at n points, in groups of neighbors. */
+static void disti_groups_eval(const dist_shape *shape, int worker, size_t n, const float *points, float *sdf)
+{
+    disti_block b;
+    disti_group g;
+    size_t bytes = disti_block_layout(shape->net, disti_lane(shape->ctx, worker), &b);
+    float value[DISTI_GROUP_POINTS];
+    disti_group_layout(shape->net, disti_lane(shape->ctx, worker) + bytes, &g);
+    for (size_t at = 0; at < n; at += DISTI_SORTED) {
+        int count = (int)DISTI_MIN(n - at, (size_t)DISTI_SORTED);
+        for (int i = 0; i < count; i++) g.order[i] = i;
+        disti_sort_points(points + 3 * at, g.order, 0, count);
+        for (int first = 0; first < count; first += DISTI_GROUP_POINTS) {
+            int part = DISTI_MIN(count - first, (int)DISTI_GROUP_POINTS);
+            for (int i = 0; i < part; i++)
+                memcpy(g.points + 3 * i, points + 3 * (at + (size_t)g.order[first + i]), 3 * sizeof(float));
+            if (part <= DISTI_BLOCK || !disti_group_eval(shape, worker, &g, &b, part, g.points, value))
+                disti_shape_fused((void *)(uintptr_t)shape, worker, (size_t)part, g.points, value, NULL, NULL, NULL, NULL);
+            for (int i = 0; i < part; i++) sdf[at + (size_t)g.order[first + i]] = value[i];
+        }
+    }
+}
+
 static void disti_shape_eval_fn(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
 {
     const dist_shape *shape = (const dist_shape *)user;
     if (!gradient && disti_wide_floats(shape->ctx, shape->net) > 0) disti_wide_eval(shape, worker, n, points, sdf);
+    else if (!gradient && shape->groups && n > DISTI_BLOCK) disti_groups_eval(shape, worker, n, points, sdf);
     else disti_shape_fused(user, worker, n, points, sdf, gradient, NULL, NULL, NULL);
 }
 
@@ -6273,8 +6757,10 @@ static dist_status disti_shape_take(dist_shape *shape)
     dist_context *ctx = shape->ctx;
     const dist_net *net = shape->net;
     disti_block b;
-    dist_status status = disti_lanes_reserve(ctx, disti_block_layout(net, NULL, &b) +
-                                                      disti_wide_floats(ctx, net) * sizeof(float));
+    disti_group g;
+    shape->groups = disti_net_groups(ctx, net);
+    size_t more = shape->groups ? disti_group_layout(net, NULL, &g) : disti_wide_floats(ctx, net) * sizeof(float);
+    dist_status status = disti_lanes_reserve(ctx, disti_block_layout(net, NULL, &b) + more);
     if (status == DIST_OK) status = disti_partial_for(ctx, (size_t)net->code_size);
     if (status != DIST_OK) return status;
     shape->code = (float *)disti_alloc(ctx, (size_t)net->code_size * sizeof(float));

@@ -216,6 +216,7 @@ typedef struct dist_field {
     float lipschitz_far; /* the same where f is larger; 0: lipschitz */
     float clamp;     /* |f| above this carries no distance (a clamped training); 0: none */
     int kinks;       /* 1: grad f jumps (ReLU), which second_fn leaves out: a normal's gradient is by differences */
+    int many;        /* 1: eval_fn is the faster the more points it gets at once, up to thousands */
     int code_size;   /* length of d_code */
     size_t weight_count;
     int color_code_size;       /* length of d_color_code */
@@ -976,7 +977,7 @@ struct dist_context {
 
 enum {
     DISTI_COUNTER_BYTES = 64,
-    DISTI_TRACE_BYTES = 1280 * 1024,
+    DISTI_TRACE_BYTES = 1920 * 1024,
     DISTI_SCRATCH_BYTES = DISTI_COUNTER_BYTES + DISTI_TRACE_BYTES
 };
 /* Sums that must not depend on the number of threads are kept in this many slots. */
@@ -5852,36 +5853,38 @@ enum {
 };
 
 typedef struct disti_group {
-    float *x[2];     /* (GROUP, max_rows, B): a layer's input: rows of the units that are computed, then the point's */
+    float *x[2];     /* (GROUP, width, B): a layer's input: rows of the units that are computed, then the point's */
     float *point, *away; /* (GROUP, 3, B): the points, and from the group's center */
-    float *panels, *bias; /* (max_rows, max_rows), max_rows: packed */
+    float *panels, *bias; /* panel_size, max_rows: packed */
     float *model;    /* (max_rows, 8): A, J, E of the rows in `list` */
     float *sum;      /* (5, max_rows): of each output, see disti_bound; its row 0 then has the bound */
     float *top;      /* max_rows */
     uint64_t *mask;  /* (GROUP, max_rows) */
     int *alive;      /* (GROUP, max_rows): rows of x alive in the block */
     int *unit[2];    /* (max_rows): which unit each row of x is */
-    int *list;       /* (max_rows): columns of the layer's weights for rows alive in any block */
-    int *place;      /* and these rows */
+    int *list;       /* (max_rows): which columns of the layer's weights the rows of x are */
     int *order;      /* DISTI_SORTED */
     float *points;   /* (GROUP_POINTS, 3), in that order */
+    size_t width, panel_size; /* room for three quarters of all units, of the weights for a third */
     float cell[6 * DISTI_CELLS], center[3], half[3];
     int alive_count[DISTI_GROUP];
     int blocks, columns, cells, count; /* columns: of the last block, up to a multiple of 16; count: of list */
 } disti_group;
 
-/* Returns the bytes needed, as disti_block_layout does. */
-static size_t disti_group_layout(const dist_net *net, unsigned char *base, disti_group *g)
+/* Returns the bytes needed, as disti_block_layout does; b: the worker's block, whose activations it shares. */
+static size_t disti_group_layout(const dist_net *net, unsigned char *base, const disti_block *b, disti_group *g)
 {
     size_t at = 0, rows = (size_t)net->max_rows, row = DISTI_BLOCK * sizeof(float);
     memset(g, 0, sizeof *g);
-    for (int i = 0; i < 2; i++) {
-        g->x[i] = (float *)disti_take(base, &at, DISTI_GROUP * rows, row);
-        g->unit[i] = (int *)disti_take(base, &at, rows, sizeof(int));
-    }
+    g->width = (rows * 3 / 4 + 7) & ~(size_t)7;
+    g->panel_size = rows * rows / 3;
+    g->x[0] = b->act[0]; /* and the three after it: they are not used at the same time */
+    g->x[1] = (float *)disti_take(base, &at, DISTI_GROUP * g->width, row);
+    g->unit[0] = (int *)disti_take(base, &at, rows, sizeof(int));
+    g->unit[1] = (int *)disti_take(base, &at, rows, sizeof(int));
     g->point = (float *)disti_take(base, &at, DISTI_GROUP * 3, row);
     g->away = (float *)disti_take(base, &at, DISTI_GROUP * 3, row);
-    g->panels = (float *)disti_take(base, &at, rows * rows, sizeof(float));
+    g->panels = (float *)disti_take(base, &at, g->panel_size, sizeof(float));
     g->bias = (float *)disti_take(base, &at, rows, sizeof(float));
     g->model = (float *)disti_take(base, &at, rows * 8, sizeof(float));
     g->sum = (float *)disti_take(base, &at, rows * 5, sizeof(float));
@@ -5889,7 +5892,6 @@ static size_t disti_group_layout(const dist_net *net, unsigned char *base, disti
     g->mask = (uint64_t *)disti_take(base, &at, DISTI_GROUP * rows, sizeof(uint64_t));
     g->alive = (int *)disti_take(base, &at, DISTI_GROUP * rows, sizeof(int));
     g->list = (int *)disti_take(base, &at, rows, sizeof(int));
-    g->place = (int *)disti_take(base, &at, rows, sizeof(int));
     g->order = (int *)disti_take(base, &at, DISTI_SORTED, sizeof(int));
     g->points = (float *)disti_take(base, &at, DISTI_GROUP_POINTS * 3, sizeof(float));
     return at;
@@ -5898,10 +5900,10 @@ static size_t disti_group_layout(const dist_net *net, unsigned char *base, disti
 /* Whether it is tried: wide nets of units that can be dead and of inputs that are the point itself. */
 static int disti_net_groups(const dist_context *ctx, const dist_net *net)
 {
-    int narrow = net->max_rows, widest = net->max_rows;
+    int narrow = net->max_rows;
     for (int l = 0; l + 1 < net->layers; l++) narrow = DISTI_MIN(narrow, net->layer[l].out);
     return net->activation == DIST_ACTIVATION_RELU && !net->normed && net->levels == 0 && net->layers > 2 &&
-           narrow >= 96 && widest <= 1100 && (!ctx->blas.sgemm_fn || narrow < ctx->blas_width);
+           narrow >= 96 && net->max_rows <= 1100 && (!ctx->blas.sgemm_fn || narrow < ctx->blas_width);
 }
 
 /* Puts order[begin..end-1] such that neighbors stand together: cut across the longest side of their box, in whole
@@ -5976,18 +5978,16 @@ static void disti_group_begin(disti_group *g, int n, const float *points)
     }
 }
 
-/* One row of the input, as it stands over the group, to the model's next entry: column `column` of the weights, row
-   `place` of x. slack: what rounding may add, relative. */
-static void disti_group_model(disti_group *g, int column, int place, const float slope[3], float least, float most,
-                              float slack)
+/* One row of the input, as it stands over the group, to the model's next entry: column `column` of the weights.
+   slack: what rounding may add, relative. */
+static void disti_group_model(disti_group *g, int column, const float slope[3], float least, float most, float slack)
 {
     float *m = g->model + (size_t)g->count * 8, middle = 0.5f * (least + most), reach = 0.0f;
-    g->list[g->count] = column;
-    g->place[g->count++] = place;
+    g->list[g->count++] = column;
     m[0] = middle;
     for (int k = 0; k < 3; k++) {
         m[1 + k] = slope[k];
-        reach += (slope[k] < 0.0f ? -slope[k] : slope[k]) * (g->half[k] + (g->center[k] < 0 ? -g->center[k] : g->center[k]));
+        reach += (slope[k] < 0.0f ? -slope[k] : slope[k]) * g->half[k];
     }
     float range = DISTI_MAX(most - middle, middle - least);
     m[4] = range + slack * (range + reach + (middle < 0.0f ? -middle : middle));
@@ -6021,23 +6021,22 @@ static int disti_group_units(const dist_shape *shape, const disti_kernels *kerne
     return count;
 }
 
-/* The weights of those `out` units for the rows in g->list, and their biases: panels for g->place's rows of x. */
-static void disti_group_pack(const dist_shape *shape, disti_group *g, int l, int rows, int out, const int *unit)
+/* The weights of those `out` units for the rows in g->list, and their biases. */
+static void disti_group_pack(const dist_shape *shape, disti_group *g, int l, int out, const int *unit)
 {
     const dist_net *net = shape->net;
     const disti_linear *layer = &net->layer[l];
     size_t panel = (size_t)(layer->prev + layer->point) * 8;
     for (int o = 0; o < out; o += 8) {
         const float *from[8];
-        float *to = g->panels + (size_t)o * (size_t)rows;
+        float *row = g->panels + (size_t)o * (size_t)g->count;
         for (int i = 0; i < 8; i++) {
             size_t u = (size_t)unit[DISTI_MIN(o + i, out - 1)];
             from[i] = net->panels + layer->panel + u / 8 * panel + u % 8;
             g->bias[o + i] = shape->bias[(size_t)l * (size_t)net->max_rows + u];
         }
-        for (int j = 0; j < g->count; j++) {
+        for (int j = 0; j < g->count; j++, row += 8) {
             const size_t k = (size_t)g->list[j] * 8;
-            float *row = to + (size_t)g->place[j] * 8;
             row[0] = from[0][k];
             row[1] = from[1][k];
             row[2] = from[2][k];
@@ -6050,21 +6049,20 @@ static void disti_group_pack(const dist_shape *shape, disti_group *g, int l, int
     }
 }
 
-/* Hidden layer l of the group's blocks: x, `rows` rows of it, to y's `out`. */
-static void disti_group_layer(const dist_shape *shape, const disti_kernels *kernels, disti_group *g, int l, int rows,
-                              int out)
+/* Hidden layer l of the group's blocks: x to `out` rows. */
+static void disti_group_layer(const dist_shape *shape, const disti_kernels *kernels, disti_group *g, int l, int out)
 {
     const dist_net *net = shape->net;
     size_t width = (size_t)net->max_rows;
     disti_gemm m;
     m.weights = g->panels;
     m.bias = g->bias;
-    m.rows = rows;
+    m.rows = g->count;
     m.out = out;
     m.relu = 1;
     for (int j = 0; j < g->blocks; j++) {
-        m.x = g->x[l & 1] + (size_t)j * width * DISTI_BLOCK;
-        m.y = g->x[(l + 1) & 1] + (size_t)j * width * DISTI_BLOCK;
+        m.x = g->x[l & 1] + (size_t)j * g->width * DISTI_BLOCK;
+        m.y = g->x[(l + 1) & 1] + (size_t)j * g->width * DISTI_BLOCK;
         m.alive = g->alive + (size_t)j * width;
         m.alive_count = g->alive_count[j];
         m.mask = g->mask + (size_t)j * width;
@@ -6073,45 +6071,47 @@ static void disti_group_layer(const dist_shape *shape, const disti_kernels *kern
     }
 }
 
-/* The input rows of layer l: the point's at the end of the `units` there are, the lists of what is alive, the model. */
+/* The input rows of layer l: of the `units` computed those that are alive, then the point; their lists, their model. */
 static void disti_group_input(const dist_shape *shape, const disti_kernels *kernels, disti_group *g, int l, int units,
                               float slack)
 {
     const dist_net *net = shape->net;
     const disti_linear *layer = &net->layer[l];
-    size_t width = (size_t)net->max_rows, stride = width * DISTI_BLOCK;
+    size_t width = (size_t)net->max_rows, stride = g->width * DISTI_BLOCK;
     const int *unit = g->unit[l & 1];
     float *x = g->x[l & 1];
+    uint64_t full = ((uint64_t)1 << DISTI_BLOCK) - 1;
     g->count = 0;
-    for (int j = 0; j < g->blocks; j++) {
-        int *alive = g->alive + (size_t)j * width, count = 0;
-        const uint64_t *mask = g->mask + (size_t)j * width;
-        for (int u = 0; u < units; u++) {
-            alive[count] = u;
-            count += mask[u] != 0;
-        }
-        for (int i = 0; i < layer->point; i++) alive[count++] = units + i;
-        g->alive_count[j] = count;
-        memcpy(x + (size_t)j * stride + (size_t)units * DISTI_BLOCK, g->point + (size_t)j * 3 * DISTI_BLOCK,
-               (size_t)layer->point * DISTI_BLOCK * sizeof(float));
-    }
+    memset(g->alive_count, 0, sizeof g->alive_count);
     for (int u = 0; u < units; u++) {
-        uint64_t any = 0, all = ((uint64_t)1 << DISTI_BLOCK) - 1;
+        uint64_t any = 0, all = full;
+        float slope[3], least, most, *row = x + (size_t)u * DISTI_BLOCK, *to = x + (size_t)g->count * DISTI_BLOCK;
         for (int j = 0; j < g->blocks; j++) {
             uint64_t mask = g->mask[(size_t)j * width + (size_t)u];
             any |= mask;
             all &= j + 1 < g->blocks ? mask : mask | ~(uint64_t)0 << g->columns;
         }
         if (!any) continue;
-        float slope[3], least, most, share = all == ((uint64_t)1 << DISTI_BLOCK) - 1 ? 1.0f : 0.5f;
-        for (size_t k = 0; k < 3; k++) slope[k] = share * g->sum[(1 + k) * width + (size_t)unit[u]];
-        kernels->fit(g->blocks, g->columns, x + (size_t)u * DISTI_BLOCK, stride, g->away, slope, &least, &most);
-        disti_group_model(g, unit[u], u, slope, least, most, slack);
+        for (size_t k = 0; k < 3; k++)
+            slope[k] = (all == full ? 1.0f : 0.5f) * g->sum[(1 + k) * width + (size_t)unit[u]];
+        kernels->fit(g->blocks, g->columns, row, stride, g->away, slope, &least, &most);
+        for (int j = 0; j < g->blocks; j++) { /* what is alive moves together */
+            size_t at = (size_t)j * width;
+            if (g->mask[at + (size_t)u]) g->alive[at + (size_t)g->alive_count[j]++] = g->count;
+            if (row != to) memcpy(to + (size_t)j * stride, row + (size_t)j * stride, DISTI_BLOCK * sizeof(float));
+        }
+        disti_group_model(g, unit[u], slope, least, most, slack);
+    }
+    for (int j = 0; j < g->blocks; j++) {
+        memcpy(x + (size_t)j * stride + (size_t)g->count * DISTI_BLOCK, g->point + (size_t)j * 3 * DISTI_BLOCK,
+               (size_t)layer->point * DISTI_BLOCK * sizeof(float));
+        for (int i = 0; i < layer->point; i++)
+            g->alive[(size_t)j * width + (size_t)g->alive_count[j]++] = g->count + i;
     }
     for (int i = 0; i < layer->point; i++) {
         float slope[3] = {0, 0, 0};
         slope[i] = 1.0f;
-        disti_group_model(g, layer->prev + i, units + i, slope, g->center[i], g->center[i], slack);
+        disti_group_model(g, layer->prev + i, slope, g->center[i], g->center[i], slack);
     }
 }
 
@@ -6130,11 +6130,12 @@ static int disti_group_eval(const dist_shape *shape, int worker, disti_group *g,
     disti_group_input(shape, &kernels, g, 0, 0, slack);
     for (int l = 0; l < last; l++) {
         const disti_linear *layer = &net->layer[l];
-        int *unit = g->unit[(l + 1) & 1], rows = units + layer->point;
+        int *unit = g->unit[(l + 1) & 1];
         units = disti_group_units(shape, &kernels, g, l, slack, unit);
-        if (l == 1 && 4 * units > 3 * layer->out) return 0;
-        disti_group_pack(shape, g, l, rows, units, unit);
-        disti_group_layer(shape, &kernels, g, l, rows, units);
+        size_t most = ((size_t)units + 7) & ~(size_t)7;
+        if (most + (size_t)net->layer[l + 1].point > g->width || most * (size_t)g->count > g->panel_size) return 0;
+        disti_group_pack(shape, g, l, units, unit);
+        disti_group_layer(shape, &kernels, g, l, units);
         done += 5.0 * (double)g->count * layer->out;
         for (int j = 0; j < g->blocks; j++) {
             int columns = DISTI_MIN(n - j * DISTI_BLOCK, (int)DISTI_BLOCK);
@@ -6144,14 +6145,14 @@ static int disti_group_eval(const dist_shape *shape, int worker, disti_group *g,
     }
     const disti_linear *layer = &net->layer[last];
     const float *w = net->panels + layer->panel + (size_t)net->sdf_channel * (size_t)(layer->prev + layer->point);
-    for (int j = 0; j < g->count; j++) g->panels[g->place[j]] = w[g->list[j]];
+    for (int j = 0; j < g->count; j++) g->panels[j] = w[g->list[j]];
     b->last = g->panels;
     b->values = 1;
     for (int j = 0; j < g->blocks; j++) {
         b->columns = DISTI_MIN(n - j * DISTI_BLOCK, (int)DISTI_BLOCK);
         b->alive_count[last] = g->alive_count[j];
         memcpy(b->alive + (size_t)last * width, g->alive + (size_t)j * width, (size_t)g->alive_count[j] * sizeof(int));
-        disti_net_output(shape, b, g->x[last & 1] + (size_t)j * width * DISTI_BLOCK, net->sdf_channel, b->tail,
+        disti_net_output(shape, b, g->x[last & 1] + (size_t)j * g->width * DISTI_BLOCK, net->sdf_channel, b->tail,
                          b->tail + DISTI_BLOCK, NULL);
         memcpy(sdf + j * DISTI_BLOCK, b->tail, (size_t)b->columns * sizeof(float));
         done += (double)g->alive_count[j] * (double)b->columns;
@@ -6162,13 +6163,14 @@ static int disti_group_eval(const dist_shape *shape, int worker, disti_group *g,
 }
 
 /* f at n points, in groups of neighbors. */
-static void disti_groups_eval(const dist_shape *shape, int worker, size_t n, const float *points, float *sdf)
+static void disti_groups_eval(void *user, int worker, size_t n, const float *points, float *sdf)
 {
+    const dist_shape *shape = (const dist_shape *)user;
     disti_block b;
     disti_group g;
     size_t bytes = disti_block_layout(shape->net, disti_lane(shape->ctx, worker), &b);
     float value[DISTI_GROUP_POINTS];
-    disti_group_layout(shape->net, disti_lane(shape->ctx, worker) + bytes, &g);
+    disti_group_layout(shape->net, disti_lane(shape->ctx, worker) + bytes, &b, &g);
     for (size_t at = 0; at < n; at += DISTI_SORTED) {
         int count = (int)DISTI_MIN(n - at, (size_t)DISTI_SORTED);
         for (int i = 0; i < count; i++) g.order[i] = i;
@@ -6178,7 +6180,7 @@ static void disti_groups_eval(const dist_shape *shape, int worker, size_t n, con
             for (int i = 0; i < part; i++)
                 memcpy(g.points + 3 * i, points + 3 * (at + (size_t)g.order[first + i]), 3 * sizeof(float));
             if (part <= DISTI_BLOCK || !disti_group_eval(shape, worker, &g, &b, part, g.points, value))
-                disti_shape_fused((void *)(uintptr_t)shape, worker, (size_t)part, g.points, value, NULL, NULL, NULL, NULL);
+                disti_shape_fused(user, worker, (size_t)part, g.points, value, NULL, NULL, NULL, NULL);
             for (int i = 0; i < part; i++) sdf[at + (size_t)g.order[first + i]] = value[i];
         }
     }
@@ -6188,7 +6190,7 @@ static void disti_shape_eval_fn(void *user, int worker, size_t n, const float *p
 {
     const dist_shape *shape = (const dist_shape *)user;
     if (!gradient && disti_wide_floats(shape->ctx, shape->net) > 0) disti_wide_eval(shape, worker, n, points, sdf);
-    else if (!gradient && shape->groups && n > DISTI_BLOCK) disti_groups_eval(shape, worker, n, points, sdf);
+    else if (!gradient && shape->groups && n > DISTI_GROUP_POINTS) disti_groups_eval(user, worker, n, points, sdf);
     else disti_shape_fused(user, worker, n, points, sdf, gradient, NULL, NULL, NULL);
 }
 
@@ -6682,6 +6684,7 @@ DIST_API dist_field dist_shape_field(dist_shape *shape)
     field.lipschitz_far = shape->lipschitz_far;
     field.clamp = net->clamp;
     field.kinks = net->activation == DIST_ACTIVATION_RELU;
+    field.many = shape->groups;
     field.code_size = net->code_size;
     return field;
 }
@@ -6759,8 +6762,9 @@ static dist_status disti_shape_take(dist_shape *shape)
     disti_block b;
     disti_group g;
     shape->groups = disti_net_groups(ctx, net);
-    size_t more = shape->groups ? disti_group_layout(net, NULL, &g) : disti_wide_floats(ctx, net) * sizeof(float);
-    dist_status status = disti_lanes_reserve(ctx, disti_block_layout(net, NULL, &b) + more);
+    size_t bytes = disti_block_layout(net, NULL, &b);
+    size_t more = shape->groups ? disti_group_layout(net, NULL, &b, &g) : disti_wide_floats(ctx, net) * sizeof(float);
+    dist_status status = disti_lanes_reserve(ctx, bytes + more);
     if (status == DIST_OK) status = disti_partial_for(ctx, (size_t)net->code_size);
     if (status != DIST_OK) return status;
     shape->code = (float *)disti_alloc(ctx, (size_t)net->code_size * sizeof(float));
@@ -8612,7 +8616,7 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
 }
 
 /* A worker's share of the tracer's memory. */
-enum { DISTI_TILE = 64, DISTI_TILE_RAYS = (DISTI_TILE + 1) * (DISTI_TILE + 1) };
+enum { DISTI_TILE = 88, DISTI_TILE_USUAL = 64, DISTI_TILE_RAYS = (DISTI_TILE + 1) * (DISTI_TILE + 1) };
 
 /* Spheres that samples of the tile's rays prove empty, and the parts of each ray that those of the rays around it
    cover, looked up when it sets out. A ray that is about to step skips what is covered. Pool full: no more are kept. */
@@ -8670,7 +8674,7 @@ typedef struct disti_bench { /* the work bench of one task */
     float least;         /* smallest ball worth keeping */
 } disti_bench;
 
-enum { DISTI_REST_BYTES = 480 * 1024 };
+enum { DISTI_REST_BYTES = 704 * 1024 };
 
 static void disti_bench_init(const dist_context *ctx, int worker, disti_bench *bench)
 {
@@ -9329,7 +9333,7 @@ enum {
     DISTI_CONE_FIRST = 32,
     DISTI_CONE_LEAF = 4,
     DISTI_CONE_RAYS = 4, /* fewer march by themselves */
-    DISTI_CONES_MOST = 4 + 16 + 64 + 256
+    DISTI_CONES_MOST = 9 * (1 + 4 + 16 + 64)
 };
 
 enum { DISTI_CONE_THROUGH, DISTI_CONE_BLOCKED, DISTI_CONE_SPLIT, DISTI_CONE_MARCHES };
@@ -11340,8 +11344,10 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     job.view = &view;
     job.out = out;
     job.tape = tape;
-    job.tile = tracer.how.trace == DIST_TRACE_PAPER || (double)view.width * view.height < 384.0 * 384.0 ? DISTI_TILE / 2
-                                                                                                        : DISTI_TILE;
+    job.tile = tracer.how.trace == DIST_TRACE_PAPER || (double)view.width * view.height < 384.0 * 384.0
+                   ? DISTI_TILE_USUAL / 2
+                   : field->many ? DISTI_TILE
+                                 : DISTI_TILE_USUAL;
     job.across = (view.width + job.tile - 1) / job.tile;
     job.predict = disti_render_predicts(&tracer, &view);
     job.least = out->silhouette || (tape && tracer.how.relax_band > 0.0f);

@@ -361,6 +361,50 @@ TEST(a_dead_unit_that_is_left_out_changes_no_bit)
     }
 }
 
+/* Units that a bound proves dead over a group of neighbors are not computed: the bits are those of any one point. */
+TEST(rows_that_are_left_out_change_no_bit)
+{
+    enum { MANY = 2111 };
+    static float points[3 * MANY], sdf[3][MANY];
+    for (int from = 0; from < 2; from++) {
+        model_desc desc = {.hidden = 5, .width = 131, .skip = 3, .code_size = 2};
+        dist_context *ctx = test_context();
+        model m = model_make(&desc, 5);
+        dist_net *net = from ? dist_net_load_file(ctx, "../shared/data/nets/deepsdf_512.safetensors")
+                             : model_load(ctx, &m);
+        model_free(&m);
+        if (!net) { /* without the data */
+            dist_context_destroy(ctx);
+            continue;
+        }
+        dist_shape *shape = dist_shape_create(ctx, net, dist_net_code(net, 0));
+        dist_field field = dist_shape_field(shape);
+        test_random random = test_random_seed(3);
+        float spread[3] = {0.02f, 0.4f, 0.1f}; /* near each other, a sheet, and in between */
+        double done[3] = {0, 0, 0};
+        CHECK(shape->groups);
+        for (int round = 0; round < 3; round++) {
+            test_random_fill(&random, 3 * MANY, points, -spread[round], spread[round]);
+            for (int i = 0; i < MANY && round == 1; i++) points[3 * i] = 0.3f;
+            size_t n = round == 2 ? MANY : MANY / 2;
+            for (int mode = 0; mode < 3; mode++) { /* groups, blocks, one by one */
+                disti_counter *counter = disti_counter_of(ctx, 0);
+                counter->done = 0;
+                shape->groups = mode == 0;
+                for (size_t i = 0; i < n; i += mode == 2 ? 1 : n)
+                    field.eval_fn(field.user, 0, mode == 2 ? 1 : n, points + 3 * i, sdf[mode] + i, NULL);
+                done[mode] += counter->done;
+            }
+            CHECK_BYTES(n * sizeof(float), sdf[1], sdf[0]);
+            CHECK_BYTES(n * sizeof(float), sdf[2], sdf[0]);
+        }
+        CHECK(done[0] < 0.8 * done[1]);
+        dist_shape_destroy(shape);
+        dist_net_destroy(net);
+        dist_context_destroy(ctx);
+    }
+}
+
 /* ---- saving ------------------------------------------------------------------------------------------------------ */
 
 static unsigned char *saved(dist_context *ctx, const dist_net *net, size_t *size)
@@ -1134,6 +1178,7 @@ int main(int argc, char **argv)
     RUN(operations_of_a_net_are_its_multiply_adds);
     RUN(a_point_has_the_same_bits_in_every_batch);
     RUN(a_dead_unit_that_is_left_out_changes_no_bit);
+    RUN(rows_that_are_left_out_change_no_bit);
     RUN(a_saved_net_loads_and_saves_to_the_same_bytes_and_values);
     RUN(saving_into_too_small_a_buffer_is_refused);
     RUN(a_net_saved_to_a_file_is_loaded_from_it);

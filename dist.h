@@ -2300,7 +2300,7 @@ DISTI_PLAIN(scalar, static)
 
 /* Two vectors of outputs at a time: of two panels, or of one where a vector is half a panel. */
 #define DISTI_BOUND1(j)                                                                                                \
-    { const DISTI_VEC b = DISTI_SET1(m[j]); a0##j = DISTI_FMA(b, v, a0##j); a1##j = DISTI_FMA(b, w, a1##j); }
+    { const DISTI_VEC b = DISTI_SET1(m[j]); DISTI_FMA(a0##j, b, v); DISTI_FMA(a1##j, b, w); }      
 #define DISTI_BOUND_ZERO(j) DISTI_VEC a0##j = DISTI_SET1(0.0f), a1##j = DISTI_SET1(0.0f);
 #define DISTI_BOUND_STORE(j) DISTI_STORE(s + j * g->stride, a0##j); DISTI_STORE(t + j * g->stride, a1##j);
 #define DISTI_BOUND(isa)                                                                                               \

@@ -1573,8 +1573,8 @@ typedef struct disti_kernels {
     void (*top)(size_t out, const float *sum, size_t stride, int cells, const float *cell, float *top);
     /* least and largest of x - slope . d over the lanes of several blocks; their number is a multiple of 16 but in the
        last block the first `columns` count, likewise. d (blocks, 3, B), x (blocks, stride) */
-    void (*fit)(int blocks, int columns, const float *x, size_t stride, const float *d, const float *slope, float *least,
-                float *most);
+    void (*fit)(int blocks, int columns, const float *x, size_t stride, const float *d, const float *slope,
+                float *least, float *most);
     void (*gemm_back)(const disti_gemm_back *g);
     void (*gemm_weights)(const disti_gemm_weights *g);
     /* y[c] = bias + sum_k w[k] x[k][c], c < DISTI_BLOCK, over alive rows (NULL: all): the last layer's single output */
@@ -2300,7 +2300,7 @@ DISTI_PLAIN(scalar, static)
 
 /* Two vectors of outputs at a time: of two panels, or of one where a vector is half a panel. */
 #define DISTI_BOUND1(j)                                                                                                \
-    { const DISTI_VEC b = DISTI_SET1(m[j]); DISTI_FMA(a0##j, b, v); DISTI_FMA(a1##j, b, w); }      
+    { const DISTI_VEC b = DISTI_SET1(m[j]); DISTI_FMA(a0##j, b, v); DISTI_FMA(a1##j, b, w); }
 #define DISTI_BOUND_ZERO(j) DISTI_VEC a0##j = DISTI_SET1(0.0f), a1##j = DISTI_SET1(0.0f);
 #define DISTI_BOUND_STORE(j) DISTI_STORE(s + j * g->stride, a0##j); DISTI_STORE(t + j * g->stride, a1##j);
 #define DISTI_BOUND(isa)                                                                                               \

@@ -583,7 +583,7 @@ typedef struct dist_images {
 /* Keeps what the gradient needs: one distance and one status a pixel, and the paper's K samples where asked for. */
 typedef struct dist_tape dist_tape;
 /* For pictures of exactly this camera's size and of this desc's trace, paper_row and samples.
-   With desc->warm_start the tape also keeps what the next picture can start from (12 bytes a pixel more). A dist_render
+   With desc->warm_start the tape also keeps what the next picture can start from (16 bytes a pixel more). A dist_render
    with warm_start then verifies the last picture's hits and near misses, one query each or none, instead of marching.
    It is meant for an optimization that moves the surface by less than about a pixel a step. Whatever does not
    verify, and every tile in which much has moved, is traced anew; so is the whole picture after a change of camera, of
@@ -10116,8 +10116,9 @@ struct dist_tape {
     float *s; /* (pixels): hit, or sample of smallest |f|, measured from the closest approach to the center */
     unsigned char *status;  /* (pixels): DIST_RAY_*, with DISTI_TAPE_* bits */
     float *sample;          /* (pixels, samples, 4), paper's tracer only */
-    /* (pixels), warm start only: slope at a hit, |f| at a miss; where the cones stopped; disti_nearest_task's */
-    float *value, *start, *nearest;
+    /* (pixels), warm start only: slope at a hit, |f| at a miss; where the cones stopped; disti_nearest_task's, and what
+       f is not below from there on as far as disti_warm_beside looked */
+    float *value, *start, *nearest, *beside;
     unsigned turn;          /* warm renders so far */
     int rendered, has_silhouette;
     dist_field field;
@@ -10147,7 +10148,7 @@ static size_t disti_tape_bytes(const dist_tape *tape, int part)
         break;
     case 3: bytes = DISTI_CHUNK * sizeof(disti_entry); break;
     case 4: bytes = (DISTI_CHUNK * 7 + DISTI_RUN * 12) * sizeof(float); break;
-    case 5: good = good && disti_size_mul(pixels, 3 * sizeof(float), &bytes); break;
+    case 5: good = good && disti_size_mul(pixels, 4 * sizeof(float), &bytes); break;
     }
     return good ? bytes : (size_t)-1;
 }
@@ -10211,6 +10212,7 @@ DIST_API dist_tape *dist_tape_create(dist_context *ctx, const dist_camera *camer
     if (tape->value) {
         tape->start = tape->value + (size_t)tape->width * (size_t)tape->height;
         tape->nearest = tape->start + (size_t)tape->width * (size_t)tape->height;
+        tape->beside = tape->nearest + (size_t)tape->width * (size_t)tape->height;
     }
     tape->d_sdf = tape->points + 3 * (size_t)DISTI_CHUNK;
     tape->d_points = tape->d_sdf + DISTI_CHUNK;
@@ -10446,6 +10448,7 @@ static void disti_render_pixel(const disti_render_job *job, const disti_ray *ray
                                                     ? DISTI_TAPE_NEAR
                                                     : 0));
     if (!job->tape->value) return;
+    if (!ray->kept) job->tape->beside[pixel] = 0.0f;
     job->tape->start[pixel] = ray->kept ? DISTI_MIN(job->tape->start[pixel], ray->stop) : ray->stop;
     /* a ray that was looking for the way out has no slope to start from */
     job->tape->value[pixel] = ray->status != DIST_RAY_HIT ? ray->fbest : ray->sign > 0.0f ? ray->slope : 0.0f;
@@ -10541,20 +10544,23 @@ static void disti_tile_trim(const disti_render_job *job, disti_tile *tile, const
 
    Hits. Every 8th pixel is looked for at its last distance; how far each moved, interpolated, predicts where the others
    are. A quarter of them takes one query there (a step of Newton's with the last slope ends it, as for a cold
-   prediction); the others lie between such that moved alike, and are moved with them, else they take a query, too. The
-   quarters take turns, so no error lives longer than three turns.
+   prediction), or a quarter of those where the corners around moved alike to within epsilon; the others lie between
+   such that moved alike, and are moved with them, else they take a query, too. The quarters take turns, so no error
+   lives longer than 15 turns.
    Misses. Where the cones stopped again, the least |f| is known to within what the largest change of f seen in the tile
-   takes off it each turn. Once that may have brought it near, f is asked for where it was least, and when it is near,
-   by samples on both sides how low it is now: a crossing is bracketed on the spot, what stays undecided is marched.
+   takes off it each turn, or with a silhouette to within what disti_warm_drifts interpolates. Once that may have
+   brought it near, f is asked for where it was least, and when it is near, by samples on both sides how low it is now:
+   a crossing is bracketed on the spot, what stays undecided is marched.
    What has a nearer hit beside it, not of the same slant, may be covered by that: from the nearer one's distance on,
-   the least f is looked for likewise; misses take turns at it.
+   the least f is looked for likewise, again when the bound found is used up; misses take turns at it.
+   Rays that start inside do so until the change of f may have brought them out.
    All is off for rays where f at the cones' stop is too small for the surface expected (as in disti_predict) and the
    cones prove less to be empty than when the ray was traced, and for tiles where the pixels marched anew (one hit in
    128 each turn) or the first ones contradict what is expected. */
 enum { DISTI_WARM_HITS = 128, DISTI_WARM_MISSES = 64, DISTI_WARM_MINIMA = 8 };
 
 typedef struct disti_warm {
-    const dist_tape *tape;
+    dist_tape *tape;
     const disti_tracer *tracer;
     const disti_tile *tile;
     const disti_bench *bench;
@@ -10665,18 +10671,24 @@ static void disti_warm_newton(disti_warm *warm)
     warm->count = 0;
 }
 
-/* Interpolated from the corners of the pixel's 8 x 8 block, as far as they are known. */
-static float disti_warm_guess(const disti_warm *warm, const float *moved, int i)
+/* Interpolated from the corners of the pixel's 8 x 8 block, as far as they are known; *spread gets how much all four
+   differ, 3e38 if one is not known. */
+static float disti_warm_guess(const disti_warm *warm, const float *moved, int i, float *spread)
 {
-    int width = warm->tile->width, height = warm->tile->height, x = i % width, y = i / width;
-    float sum = 0.0f, weights = 0.0f;
+    int width = warm->tile->width, height = warm->tile->height, x = i % width, y = i / width, known = 0;
+    float sum = 0.0f, weights = 0.0f, low = 3e38f, high = -3e38f;
     for (int k = 0; k < 4; k++) {
         int right = k & 1, down = k >> 1, cx = (x & ~7) + 8 * right, cy = (y & ~7) + 8 * down;
         if (cx >= width || cy >= height || moved[cy * width + cx] > 2e38f) continue;
         float weight = (float)((right ? x & 7 : 8 - (x & 7)) * (down ? y & 7 : 8 - (y & 7)));
-        sum += weight * moved[cy * width + cx];
+        float move = moved[cy * width + cx];
+        sum += weight * move;
         weights += weight;
+        low = DISTI_MIN(low, move);
+        high = DISTI_MAX(high, move);
+        known++;
     }
+    *spread = known == 4 ? high - low : 3e38f;
     return weights > 0.0f ? sum / weights : 3e38f;
 }
 
@@ -10711,7 +10723,7 @@ static float disti_warm_between(const disti_warm *warm, const float *moves, int 
         }
     }
     float mean = known > 0 ? sum / (float)known : 3e38f, guess = 3e38f;
-    if (border) guess = disti_warm_guess(warm, moves, i);
+    if (border) guess = disti_warm_guess(warm, moves, i, spread);
     if (known > 0 && guess < 2e38f) {
         low = DISTI_MIN(low, guess);
         high = DISTI_MAX(high, guess);
@@ -10730,15 +10742,17 @@ static int disti_warm_hits(disti_warm *warm)
             int x = i % warm->tile->width, y = i / warm->tile->width;
             if (pass == 0 ? (x | y) & 7 : disti_warm_asks(warm, x, y) == (pass == 2)) continue;
             size_t pixel = disti_warm_pixel(warm, i);
-            float spread = 3e38f, s = warm->tape->s[pixel];
+            float spread = 3e38f, wide = 3e38f, s = warm->tape->s[pixel];
             float move = pass == 2 ? disti_warm_between(warm, warm->moved, i, &spread) : 0.0f;
-            if (pass > 0 && spread > 2e38f) move = disti_warm_guess(warm, warm->moved, i);
+            if (pass > 0 && spread > 2e38f) move = disti_warm_guess(warm, warm->moved, i, &wide);
             if (move > 2e38f) move = 0.0f;
             if (!disti_warm_expects(warm, i, s + move) || disti_warm_due(warm, i, DISTI_WARM_HITS)) continue;
             disti_ray *ray = &warm->bench->rays[i];
             float epsilon = disti_ray_epsilon(warm->tracer, ray, s);
             ray->slope = warm->tape->value[pixel];
             ray->q = s + move;
+            unsigned other = ((unsigned)(x / 2 + y / 2) + warm->tape->turn / 4u) & 3u;
+            if (pass == 1 && wide <= epsilon && other != 0) spread = wide;
             if (spread <= 5.0f * epsilon) disti_warm_hit(warm, i, ray->q, 0.0f, 8.0f * epsilon + 2.0f * spread);
             else warm->bench->index[warm->count++] = i;
         }
@@ -10755,12 +10769,12 @@ static int disti_warm_hits(disti_warm *warm)
     return 1;
 }
 
-/* Whether it is the tile's turn to have all of its least |f| looked for anew: while the picture has moved by about a
-   hundredth of the radius at most, in 2 to 8 turns. */
+/* Whether it is the tile's turn to have all of its least |f| looked for anew, in 2 to 8 turns: before the picture has
+   moved by about half a hundredth of the radius, so that f where it was least is still the least to second order. */
 static int disti_warm_minima_due(const disti_warm *warm, float change)
 {
     unsigned period = 2, x = (unsigned)warm->tile->x / DISTI_TILE, y = (unsigned)warm->tile->y / DISTI_TILE;
-    float most = 4e-3f * warm->tracer->field->radius;
+    float most = 2e-3f * warm->tracer->field->radius;
     while (period < DISTI_WARM_MINIMA && (float)period * change < most) period *= 2;
     return !warm->tape->has_silhouette || (x * 5u + y * 3u + warm->tape->turn) % period == 0;
 }
@@ -10844,8 +10858,8 @@ static void disti_warm_near(disti_warm *warm, size_t count)
             }
             if (more < 0) disti_warm_again(warm, i);
             else if (ray->mode != DISTI_WAIT) warm->moved[i] = 3e38f;
-            else if (ray->moved) ray->mode = DISTI_DONE;
-            else disti_ray_end(ray, DIST_RAY_MISS, ray->s, ray->f, 0.0f);
+            else if (!ray->moved) disti_ray_end(ray, DIST_RAY_MISS, ray->s, ray->f, 0.0f);
+            else ray->mode = DISTI_DONE, warm->tape->beside[disti_warm_pixel(warm, i)] = ray->f;
             ray->kept = more == 0;
         }
         count = kept;
@@ -10932,14 +10946,21 @@ static void disti_warm_misses(disti_warm *warm)
     for (int i = 0; i < warm->n; i++) {
         size_t pixel = disti_warm_pixel(warm, i);
         disti_ray *ray = &bench->rays[i];
-        int blocked = ray->mode != DISTI_DONE;
+        int blocked = ray->mode != DISTI_DONE, inside = warm->tape->status[pixel] & 15;
+        float sunk = warm->tape->value[pixel] + loss; /* f at the entry: below 0, the ray still starts inside */
+        if (inside == DIST_RAY_INSIDE && !warm->silhouette && blocked && !(ray->start > ray->enter) &&
+            sunk < -warm->tracer->noise) {
+            disti_ray_end(ray, DIST_RAY_INSIDE, ray->enter, sunk, 0.0f);
+            ray->kept = 1;
+            continue;
+        }
         if ((due && !blocked) || !disti_warm_misses_still(warm, i)) continue;
         float f = warm->tape->value[pixel], epsilon = disti_ray_epsilon(warm->tracer, ray, ray->start);
-        float lower = !warm->silhouette ? f - loss : due ? f - 12.0f * loss : f + warm->drift[i];
+        float lower = warm->silhouette && !due ? f + warm->drift[i] : f - loss;
         ray->best = warm->tape->s[pixel];
         ray->moved = 0;
         if (lower > 2e38f) continue;
-        if (blocked && (due || lower < 3.0f * (warm->change + epsilon))) {
+        if (blocked && (due || lower < 1.5f * warm->change + 3.0f * epsilon)) {
             disti_ray_point(ray, ray->best, bench->points + 3 * count);
             bench->index[count++] = i;
         } else {
@@ -10982,6 +11003,9 @@ static void disti_warm_beside(disti_warm *warm)
     for (int i = 0; i < warm->n; i++) {
         disti_ray *ray = &bench->rays[i];
         float s = warm->tape->nearest[disti_warm_pixel(warm, i)];
+        float *bound = &warm->tape->beside[disti_warm_pixel(warm, i)];
+        *bound = DISTI_MAX(*bound - warm->change, 0.0f);
+        if (*bound > 0.5f * warm->change + disti_ray_epsilon(warm->tracer, ray, s)) continue;
         int hit = warm->moved[i] < 2e38f && s < ray->best, miss = ray->status == DIST_RAY_MISS && ray->kept;
         miss &= (i % warm->tile->width + i / warm->tile->width + (int)(warm->tape->turn & 1u)) & 1;
         if (!warm->open[i] || ray->mode != DISTI_DONE || !(hit || miss) || s <= ray->start || s >= ray->leave) continue;
@@ -11000,10 +11024,12 @@ static void disti_warm_beside(disti_warm *warm)
             disti_ray *ray = &bench->rays[bench->index[k]];
             float f = k < asked ? bench->sdf[k] : 0.0f, epsilon = disti_ray_epsilon(warm->tracer, ray, ray->q);
             int hit = ray->status == DIST_RAY_HIT;
-            float away = hit ? 2.0f * (warm->change + epsilon) : 0.03f * warm->tracer->field->radius;
+            float away = hit ? 0.5f * warm->change + 2.0f * epsilon : 0.03f * warm->tracer->field->radius;
             if (!(f > away) || round > 16) near[close++] = bench->index[k];
             else if (hit && f < ray->f && f < -0.7f * ray->slope * (ray->best - ray->q))
                 bench->index[kept++] = bench->index[k];
+            else /* the sphere around the last sample, and those before */
+                warm->tape->beside[disti_warm_pixel(warm, bench->index[k])] = 0.5f * DISTI_MIN(f, ray->f);
             ray->f = f;
             ray->s = ray->q;
             ray->q += f / warm->tracer->lipschitz;
@@ -11098,7 +11124,7 @@ static void disti_warm_seed(const disti_tile *tile, const disti_bench *bench)
 static void disti_nearest_task(void *arg, int index, int worker)
 {
     const disti_render_job *job = (const disti_render_job *)arg;
-    const dist_tape *tape = job->tape;
+    dist_tape *tape = job->tape;
     const int dx[4] = {1, 0, 1, 1}, dy[4] = {0, 1, 1, -1};
     (void)worker;
     int last = DISTI_MIN((index + 1) * DISTI_TILE, tape->height);
@@ -11128,7 +11154,11 @@ static void disti_nearest_task(void *arg, int index, int worker)
                     tape->s[across] - s > 0.3f * ahead;
                 if (!steep) nearest = DISTI_MIN(nearest, tape->s[other]);
             }
+            float before = tape->nearest[pixel], bound = tape->beside[pixel]; /* still of the same place? */
+            if (bound > 0.0f && nearest < before + job->step && nearest > before - bound / job->tracer->lipschitz)
+                continue;
             tape->nearest[pixel] = nearest;
+            tape->beside[pixel] = 0.0f;
         }
     }
 }

@@ -215,6 +215,7 @@ typedef struct dist_field {
     float lipschitz;     /* bound or estimate of |grad f| where 0 < f < clamp / 2 (no clamp: radius / 20); 0: 1 */
     float lipschitz_far; /* the same where f is larger; 0: lipschitz */
     float clamp;     /* |f| above this carries no distance (a clamped training); 0: none */
+    float detail;    /* the radius that the defaults of how.epsilon and normal_delta go by; 0: radius */
     int kinks;       /* 1: grad f jumps (ReLU), which second_fn leaves out: a normal's gradient is by differences */
     int many;        /* 1: eval_fn is the faster the more points it gets at once, up to thousands */
     int code_size;   /* length of d_code */
@@ -296,8 +297,9 @@ typedef struct dist_instance {
 
 /* Several instances as one field: f(p) = min over i of s_i f_i(R_i^T (p - t_i) / s_i). A point asks only the instances
    whose bounding spheres can hold the minimum, nearest first, and none of them outside its sphere: there f_i goes on as
-   a lower bound of the distance, exact up to a fifth of the sphere's radius. Defaults that go by the bounding radius
-   (how.epsilon) go by the scene's. Every point is held against every sphere: fast up to some hundred instances; more
+   a lower bound of the distance, exact up to a fifth of the sphere's radius. how.epsilon's and
+   normal_delta's defaults go by the smallest instance's radius in the world, but are no smaller than float's noise,
+   5e-7 of the scene's. Every point is held against every sphere: fast up to some hundred instances; more
    are better made scenes of scenes. Belongs to the context that made it. */
 typedef struct dist_scene dist_scene;
 /* NULL on failure. Instances may share fields; a scene's field may be an instance of another scene. */
@@ -480,7 +482,7 @@ typedef struct dist_render_desc {
     int gradient;        /* DIST_GRADIENT_*; AUTO: IMPLICIT with the guarded tracer, PAPER with the paper's */
     float gradient_cap;  /* tau: |grad f . v| counts as at least tau |grad f|; 0: 0.1 */
     int normal_mode;     /* DIST_NORMAL_* */
-    float normal_delta;  /* half step of differences, shape units; 0: 1e-3 of the bounding radius */
+    float normal_delta;  /* half step of differences, shape units; 0: 1e-3 of the bounding radius or field.detail */
     int normal_space;    /* DIST_SPACE_* */
     int inside;          /* DIST_INSIDE_* */
     float background;    /* depth and distance at a miss */
@@ -491,7 +493,8 @@ typedef struct dist_render_desc {
                          without a mask; 0: off */
     int no_cones;        /* 1: every ray marches from the bounding sphere by itself */
     int no_prediction;   /* 1: no ray starts from what its neighbors found */
-    int certified;       /* 1: only steps that the Lipschitz figures prove; nothing is missed where these are bounds */
+    int certified;       /* 1: only steps that the Lipschitz figures prove; nothing is missed where these are bounds:
+                            a net's are sampled, dist_stats.steepest says when they were too small */
     /* dist_trace only. any_hit 1: a ray ends as soon as anything is certain to block it, for shadows; its distance is
        then that of a sample inside what blocks, its error how far before that it goes in. max_distance: how far a ray
        looks, in lengths of its direction (1: from origin to origin + direction); 0: without end */
@@ -524,6 +527,8 @@ typedef struct dist_stats {
     double operations_done;             /* of them, those not left out as dead units */
     float epsilon;                      /* the |f| in force, smallest over the picture */
     float lipschitz;                    /* in force */
+    float steepest; /* the figure that samples following one another along a ray called for, where that is above the
+                       one in force, else 0: then how.certified proves nothing, render again with more than this */
     float error;                        /* largest error over the hits; see dist_images.error */
 } dist_stats;
 
@@ -3034,6 +3039,9 @@ static dist_status disti_field_check(dist_context *ctx, const dist_field *field,
     if (!disti_finite(field->lipschitz) || field->lipschitz < 0.0f)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.lipschitz is %d, must be 0 or positive", function,
                           (double)field->lipschitz, 0);
+    if (!disti_finite(field->detail) || field->detail < 0.0f)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.detail is %d, must be 0 or positive", function,
+                          (double)field->detail, 0);
     if (!disti_finite(field->lipschitz_far) || field->lipschitz_far < 0.0f)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.lipschitz_far is %d, must be 0 or positive", function,
                           (double)field->lipschitz_far, 0);
@@ -4147,6 +4155,8 @@ DIST_API dist_field dist_scene_field(dist_scene *scene)
     for (int k = 0; k < scene->count; k++) {
         const dist_field *f = &scene->placed[k].field;
         float clamp = f->clamp * scene->placed[k].scale;
+        float detail = (f->detail > 0.0f ? f->detail : f->radius) * scene->placed[k].scale;
+        if (!(field.detail > 0.0f && field.detail < detail)) field.detail = detail;
         field.lipschitz = DISTI_MAX(field.lipschitz, f->lipschitz);
         field.lipschitz_far = DISTI_MAX(field.lipschitz_far, disti_steepest(f));
         if (clamp > 0.0f && !(field.clamp > 0.0f && field.clamp < clamp)) field.clamp = clamp;
@@ -7986,6 +7996,7 @@ typedef struct disti_tracer {
     const dist_field *field;
     dist_render_desc how;
     float lipschitz, epsilon, noise;
+    float detail;     /* the field's, or its radius */
     float far, ratio; /* from |f| = far on the slope is at most lipschitz / ratio */
 } disti_tracer;
 
@@ -8091,7 +8102,8 @@ static dist_status disti_tracer_init(disti_tracer *tracer, dist_context *ctx, co
     tracer->ctx = ctx;
     tracer->field = field;
     tracer->how = dist_render_desc_resolve(desc);
-    if (!desc || desc->normal_delta == 0.0f) tracer->how.normal_delta = 1e-3f * field->radius;
+    tracer->detail = field->detail > 0.0f ? field->detail : field->radius;
+    if (!desc || desc->normal_delta == 0.0f) tracer->how.normal_delta = 1e-3f * tracer->detail;
     tracer->lipschitz = tracer->how.lipschitz > 0.0f ? tracer->how.lipschitz
                         : field->lipschitz > 0.0f    ? field->lipschitz
                                                      : 1.0f;
@@ -8156,7 +8168,7 @@ static float disti_ray_epsilon(const disti_tracer *tracer, const disti_ray *ray,
 {
     if (tracer->epsilon > 0.0f) return tracer->epsilon;
     float pixel = (float)(ray->base + (double)s) * ray->footprint;
-    float epsilon = 5e-5f * tracer->field->radius;
+    float epsilon = 5e-5f * tracer->detail;
     epsilon = ray->footprint > 0.0f && pixel < epsilon ? pixel : epsilon;
     return DISTI_MAX(epsilon, tracer->noise);
 }
@@ -8873,6 +8885,23 @@ static int disti_ray_is_hit(const disti_tracer *tracer, const disti_ray *ray)
     return ray->status == DIST_RAY_HIT || (ray->status == DIST_RAY_INSIDE && tracer->how.inside == DIST_INSIDE_HIT);
 }
 
+/* Notes what the sample f at ray->q says of the Lipschitz figures. Steps are proven if E(f) = disti_empty is no more
+   than the distance from the surface; of two points at distance d, |E(f1) - E(f0)| <= d, or E(f1) + E(-f0) where the
+   signs differ. A ratio above 1 calls for as much larger figures; float noise in f is left out. */
+DISTI_INLINE void disti_stats_slope(const disti_tracer *tracer, const disti_ray *ray, float f, dist_stats *stats)
+{
+    int bracket = ray->mode == DISTI_BRACKET || ray->mode == DISTI_LEAST, back = ray->mode == DISTI_BACK;
+    if (ray->mode <= DISTI_FIRST || ray->mode == DISTI_PREDICT) return;
+    float from = (bracket ? ray->fa : back ? ray->fb : ray->f) * ray->sign;
+    float step = back ? ray->b - ray->q : ray->q - (bracket ? ray->a : ray->s);
+    float change = f > from ? f - from : from - f, noise = 2.0f * tracer->noise;
+    if (!(change * DISTI_MAX(tracer->ratio, 1.0f) > tracer->lipschitz * step + noise) || !(step > 0.0f)) return;
+    float e0 = disti_empty(tracer, from < 0.0f ? -from : from), e1 = disti_empty(tracer, f < 0.0f ? -f : f);
+    float rise = ((from < 0.0f) != (f < 0.0f) ? e0 + e1 : e0 > e1 ? e0 - e1 : e1 - e0) * tracer->lipschitz - noise;
+    if (rise > tracer->lipschitz * step && rise > stats->steepest * step && disti_finite(rise / step))
+        stats->steepest = rise / step;
+}
+
 /* Marches the `active` rays listed in bench->index, in rounds: one packed batch of points a round, until only `enough`
    are left. Returns how many are still listed. Without budget they stay as they are: 0. */
 static size_t disti_trace_rounds(const disti_tracer *tracer, int worker, const disti_bench *bench, size_t active,
@@ -8894,6 +8923,7 @@ static size_t disti_trace_rounds(const disti_tracer *tracer, int worker, const d
             if (ray->mode >= DISTI_BAND) bench->stats->refine_queries++;
             else bench->stats->march_queries++;
             if (bench->balls) disti_publish(tracer, bench, bench->index[i], bench->points + 3 * i, bench->sdf[i]);
+            disti_stats_slope(tracer, ray, bench->sdf[i], bench->stats);
             if (disti_ray_advance(tracer, ray, bench->sdf[i])) bench->index[kept++] = bench->index[i];
             else if (bench->budget) bench->budget->hits += (unsigned)disti_ray_is_hit(tracer, ray);
         }
@@ -8960,10 +8990,11 @@ static void disti_stats_end(dist_context *ctx, const disti_tracer *tracer, dist_
         out->not_finite += s->not_finite;
         out->operations += disti_counter_of(ctx, worker)->dense;
         out->operations_done += disti_counter_of(ctx, worker)->done;
+        if (s->steepest > out->steepest) out->steepest = s->steepest;
         if (s->error > out->error) out->error = s->error; /* not -0 over 0, which would tell the workers' order */
         if (s->epsilon > 0.0f) out->epsilon = DISTI_MIN(out->epsilon, s->epsilon);
     }
-    if (out->epsilon > 1e38f) out->epsilon = tracer->epsilon > 0.0f ? tracer->epsilon : 5e-5f * tracer->field->radius;
+    if (out->epsilon > 1e38f) out->epsilon = tracer->epsilon > 0.0f ? tracer->epsilon : 5e-5f * tracer->detail;
     out->lipschitz = tracer->lipschitz;
 }
 
@@ -9409,7 +9440,7 @@ static int disti_cone_advance(const disti_tracer *tracer, disti_cone *cone, floa
         cone->least_f = f;
         cone->least_t = cone->t;
     }
-    float margin = tracer->epsilon > 0.0f ? tracer->epsilon : 5e-5f * tracer->field->radius;
+    float margin = tracer->epsilon > 0.0f ? tracer->epsilon : 5e-5f * tracer->detail;
     double radius = (double)disti_empty(tracer, f - margin);
     double wide = cone->t * cone->sine;
     if (radius < 1.05 * cone->t * cone->chord || radius <= wide) return DISTI_CONE_BLOCKED;
@@ -11316,7 +11347,7 @@ static int disti_render_predicts(const disti_tracer *tracer, const disti_view *v
 }
 
 /* Mean |f| at up to 1024 of the tape's hits, evenly over the picture: how much has changed. 3e38: it has none. */
-static float disti_render_change(const disti_tracer *tracer, const disti_view *view, dist_tape *tape)
+static float disti_render_change(disti_tracer *tracer, const disti_view *view, dist_tape *tape)
 {
     enum { SIDE = 32 };
     int dx = (view->width + SIDE - 1) / SIDE, dy = (view->height + SIDE - 1) / SIDE;
@@ -11331,6 +11362,10 @@ static float disti_render_change(const disti_tracer *tracer, const disti_view *v
             disti_pixel_ray(view, tracer->field, x, y, local, &ray);
             disti_ray_point(&ray, tape->s[pixel], tape->points + 3 * count++);
         }
+    }
+    if (tracer->how.max_queries > 0) { /* out of the budget, or too much for it */
+        if (tracer->how.max_queries < 4 * (unsigned long long)count) return 3e38f;
+        tracer->how.max_queries -= count;
     }
     disti_field_eval_all(tracer->ctx, tracer->field, count, tape->points, tape->d_sdf, NULL);
     disti_bench_init(tracer->ctx, 0, &bench);

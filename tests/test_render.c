@@ -1166,6 +1166,134 @@ TEST(a_query_budget_gives_the_same_bits_for_every_number_of_workers)
     }
 }
 
+/* One picture and its gradients, with a tape that has seen `before` pictures without a budget. */
+typedef struct budgeted {
+    planes picture;
+    float code[64], camera[6];
+} budgeted;
+
+static void budget_render(dist_context *ctx, const dist_field *field, const dist_camera *camera,
+                          const dist_render_desc *how, int which, int before, int after, budgeted *x)
+{
+    static planes other;
+    static float pull[3 * PIXELS];
+    dist_images out = all_planes(&x->picture), d_out;
+    dist_gradients grads;
+    dist_tape *tape = dist_tape_create(ctx, camera, how);
+    dist_render_desc plain = *how;
+    memset(x, 0, sizeof *x);
+    memset(&d_out, 0, sizeof d_out);
+    memset(&grads, 0, sizeof grads);
+    plain.max_queries = 0;
+    if (!(which & 1)) out.silhouette = NULL;
+    if (!(which & 2)) out.normal = NULL;
+    for (int i = 0; i < 3 * PIXELS; i++) pull[i] = i % 3 ? 0.25f : -1.0f;
+    for (int i = 0; i < before; i++) {
+        dist_images first = all_planes(&other);
+        CHECK_STATUS(DIST_OK, dist_render(ctx, field, camera, &plain, &first, tape), ctx);
+    }
+    CHECK_STATUS(DIST_OK, dist_render(ctx, field, camera, how, &out, tape), ctx);
+    for (int i = 0; i < after; i++) CHECK_STATUS(DIST_OK, dist_render(ctx, field, camera, &plain, &out, tape), ctx);
+    d_out.depth = pull;
+    if (out.silhouette) d_out.silhouette = pull;
+    if (out.normal) d_out.normal = pull;
+    grads.code = x->code;
+    grads.rotation = x->camera;
+    grads.translation = x->camera + 3;
+    CHECK_STATUS(DIST_OK, dist_render_backward(ctx, tape, &d_out, &grads), ctx);
+    dist_tape_destroy(tape);
+}
+
+static int finite_all(size_t n, const float *x)
+{
+    for (size_t i = 0; i < n; i++)
+        if (!test_finite((double)x[i])) return 0;
+    return 1;
+}
+
+/* Budgets of 1, 2, 3, one less than is spent without, exactly that, and huge, for whatever there is to ask: never
+   above it, nothing but numbers, truthful statuses and bounds, a gradient, the same bits for 1 and 3 workers, and
+   afterwards a picture as if nothing had been. */
+TEST(extreme_budgets_give_the_best_so_far_and_leave_no_trace)
+{
+    enum { W = 72, H = 56, CASES = 11 };
+    static budgeted full, some, three, again;
+    static unsigned char pixels[W * H];
+    const float ball[3][4] = {{0, 0, 0, 0.5f}, {0.9f, 0, 0, 0.3f}, {-0.8f, 0.3f, 0.2f, 0.25f}};
+    const float torus[5] = {0, 0, 0, 0.6f, 0.2f};
+    dist_camera camera = shape_camera(W, H);
+    for (int i = 0; i < W * H; i++) pixels[i] = i % 7 == 0;
+    for (int k = 0; k < CASES; k++) {
+        dist_render_desc how = plain_how();
+        int which = k == 1 ? 1 : k == 2 || k == 3 ? 2 : k == 4 || k > 8 ? 3 : 0, before = k == 9 ? 2 : k == 10;
+        how.normal_mode = k == 3 ? DIST_NORMAL_DIFFERENCE : DIST_NORMAL_ANALYTIC;
+        how.certified = k == 5;
+        if (k == 6 || k == 7) how.trace = DIST_TRACE_PAPER;
+        how.paper_row = k == 7 ? DIST_PAPER_DYNAMIC : DIST_PAPER_COARSE_TO_FINE;
+        if (k == 8) how.pixels = pixels;
+        how.warm_start = before > 0;
+        for (int j = 0; j < 6; j++) {
+            for (int workers = 1; workers <= 3; workers += 2) {
+                test_scheduler scheduler;
+                dist_context_desc desc = test_context_desc();
+                dist_field parts[3], field = dist_field_torus(torus);
+                dist_instance instances[3];
+                dist_scene *scene = NULL;
+                scheduler.workers = desc.workers = workers;
+                scheduler.calls = j;
+                if (workers > 1) desc.scheduler = test_scheduler_hook(&scheduler);
+                dist_context *ctx = dist_context_create(&desc);
+                memset(instances, 0, sizeof instances);
+                for (int i = 0; i < 3; i++) {
+                    parts[i] = dist_field_sphere(ball[i]);
+                    instances[i].field = &parts[i];
+                }
+                if (k == 4 || k == 10) {
+                    scene = dist_scene_create(ctx, 3, instances);
+                    field = dist_scene_field(scene);
+                }
+                how.max_queries = 0;
+                if (workers == 1) budget_render(ctx, &field, &camera, &how, which, before, 0, &full);
+                unsigned long long need = full.picture.stats.queries;
+                const unsigned long long budgets[6] = {1, 2, 3, need - 1, need, ~0ull};
+                how.max_queries = budgets[j];
+                budgeted *x = workers == 1 ? &some : &three;
+                budget_render(ctx, &field, &camera, &how, which, before, 0, x);
+                const planes *p = &x->picture;
+                unsigned long long hits = 0, unresolved = 0;
+                int wrong = 0;
+                CHECK(p->stats.queries <= budgets[j]);
+                CHECK(finite_all(W * H, p->depth) && finite_all(W * H, p->distance) && finite_all(W * H, p->error));
+                CHECK(finite_all(3 * W * H, p->normal) && finite_all(W * H, p->silhouette));
+                CHECK(finite_all(64, x->code) && finite_all(6, x->camera) && test_finite((double)p->stats.error));
+                for (int i = 0; i < W * H; i++) {
+                    double off = fabs((double)p->distance[i] - (double)full.picture.distance[i]);
+                    hits += p->mask[i];
+                    unresolved += p->status[i] == DIST_RAY_UNRESOLVED;
+                    if (how.trace == DIST_TRACE_PAPER) continue;
+                    wrong += p->mask[i] && full.picture.status[i] == DIST_RAY_MISS;
+                    if (!full.picture.mask[i]) continue;
+                    wrong += !p->mask[i] && p->status[i] != DIST_RAY_UNRESOLVED;
+                    wrong += off > (double)p->error[i] + (double)full.picture.error[i] + 2e-6;
+                }
+                CHECK_EQUAL(hits, p->stats.hits);
+                CHECK_EQUAL(unresolved, p->stats.unresolved);
+                if (!CHECK(wrong * 500 <= (int)full.picture.stats.hits)) /* two traces of what only touches */
+                    printf("    case %d, budget %d, %d workers: %d wrong of %d\n", k, j, workers, wrong,
+                           (int)full.picture.stats.hits);
+                if (j == 5) CHECK_BYTES(offsetof(planes, stats), &full.picture, p);
+                if (workers == 3) CHECK_BYTES(sizeof some, &some, &three);
+                if (j == 1 && before == 0) { /* and once more without a budget, on the same tape */
+                    budget_render(ctx, &field, &camera, &how, which, 0, 1, &again);
+                    CHECK_BYTES(sizeof full, &full, &again);
+                }
+                dist_scene_destroy(scene);
+                dist_context_destroy(ctx);
+            }
+        }
+    }
+}
+
 TEST(a_query_budget_of_free_rays_is_kept)
 {
     enum { RAYS = 2500 };
@@ -1235,6 +1363,7 @@ int main(int argc, char **argv)
 #endif
     RUN(a_query_budget_is_kept_and_more_of_it_finds_more);
     RUN(a_query_budget_gives_the_same_bits_for_every_number_of_workers);
+    RUN(extreme_budgets_give_the_best_so_far_and_leave_no_trace);
     RUN(a_query_budget_of_free_rays_is_kept);
     return test_report();
 }

@@ -433,6 +433,7 @@ typedef struct picture {
 } picture;
 
 static picture first, second;
+static float first_error[PIXELS], first_distance[PIXELS];
 
 static dist_images planes_of(picture *p)
 {
@@ -571,6 +572,72 @@ TEST(a_scene_of_one_unmoved_instance_looks_like_its_field)
         dist_scene_destroy(scene);
         mixture_close(&x);
     }
+    dist_context_destroy(ctx);
+}
+
+/* The default epsilon and the step of differences go by the smallest instance: a ball a hundredth of the other's size
+   is as round as it is alone. */
+TEST(a_small_instance_is_as_sharp_as_alone)
+{
+    dist_context *ctx = test_context();
+    const float large[4] = {0, 0, 0, 1}, small[4] = {0, 0, 0, 1};
+    dist_field fields[2];
+    dist_instance instances[2];
+    memset(instances, 0, sizeof instances);
+    fields[0] = dist_field_sphere(large);
+    fields[1] = dist_field_sphere(small);
+    instances[0].field = &fields[0];
+    instances[1].field = &fields[1];
+    instances[1].placement.scale = 0.01f;
+    instances[1].placement.translation[0] = 1.2f;
+    dist_scene *scene = dist_scene_create(ctx, 2, instances);
+    dist_field field = dist_scene_field(scene);
+    float eye[3] = {1.2f, 0, 0.05f}, at[3] = {1.2f, 0, 0}, up[3] = {0, 1, 0};
+    dist_camera camera = dist_camera_look_at(SIDE, SIDE, 0.42f, eye, at, up);
+    CHECK_NEAR(0.01 * (double)fields[1].radius, field.detail, 1e-8);
+    double bounds[3] = {0, 0, 0};
+    for (int mode = 0; mode < 3; mode++) { /* the last: as if the defaults went by the scene's radius */
+        dist_images out = planes_of(&first);
+        dist_render_desc how;
+        int judged = 0, dull = 0, wrong = 0;
+        double worst = 0;
+        if (mode == 2) field.detail = 0;
+        memset(&how, 0, sizeof how);
+        how.normal_mode = mode == 1;
+        out.error = first_error;
+        out.distance = first_distance;
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+        for (int i = 0; i < PIXELS; i++) {
+            float o[3], d[3];
+            dist_camera_ray(&camera, (float)(i % SIDE), (float)(i / SIDE), o, d);
+            double c[3], along = 0, square = 0;
+            for (int k = 0; k < 3; k++) c[k] = (double)o[k] - (double)instances[1].placement.translation[k];
+            for (int k = 0; k < 3; k++) along -= c[k] * (double)d[k];
+            for (int k = 0; k < 3; k++) square += (c[k] + along * (double)d[k]) * (c[k] + along * (double)d[k]);
+            wrong += square < 0.98e-4 && !first.mask[i];
+            if (!first.mask[i] || square > 0.8e-4) continue;
+            double t = along - sqrt(1e-4 - square), dot = 0;
+            worst = fmax(worst, fabs(t - (double)first_distance[i]) - (double)first_error[i]);
+            for (int k = 0; k < 3; k++) {
+                double n = 0; /* the normal in camera space */
+                for (int l = 0; l < 3; l++)
+                    n += (double)camera.rotation[3 * k + l] * (c[l] + t * (double)d[l]) / 0.01;
+                dot += n * (double)first.normal[3 * i + k];
+            }
+            judged++;
+            dull += dot < 0.9995;
+            bounds[mode] += (double)first_error[i];
+        }
+        CHECK(judged > PIXELS / 4);
+        CHECK_EQUAL(0, wrong);
+        CHECK(worst < 1e-6);
+        CHECK(dull * 50 <= judged);
+        if (test_state.verbose)
+            printf("    mode %d: %d judged, %d dull, worst %.1e, mean bound %.1e\n", mode, judged, dull, worst,
+                   bounds[mode] / judged);
+    }
+    CHECK(bounds[0] < 0.5 * bounds[2] && bounds[1] < 0.5 * bounds[2]);
+    dist_scene_destroy(scene);
     dist_context_destroy(ctx);
 }
 
@@ -1122,6 +1189,7 @@ int main(int argc, char **argv)
     RUN(gradients_for_points_codes_and_placements_are_those_of_double);
     RUN(a_scene_looks_like_the_union_that_asks_everything);
     RUN(a_scene_of_one_unmoved_instance_looks_like_its_field);
+    RUN(a_small_instance_is_as_sharp_as_alone);
     RUN(a_scene_of_scenes_is_the_flat_scene);
     RUN(twenty_instances_cost_a_query_no_more_than_one_and_a_fifth);
     RUN(a_scene_has_the_same_bits_for_any_number_of_threads);

@@ -1122,6 +1122,66 @@ static void bound_check_decoder(dist_context *ctx, const char *path, int code, d
     dist_net_destroy(net);
 }
 
+/* dist_stats.steepest: 0 where the figure is a bound; where it is not, more than it and no more than the true one. */
+TEST(a_slope_beyond_the_lipschitz_figure_is_reported)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(SIDE, SIDE);
+    shape_case cases[CASES];
+    shape_cases(cases);
+    for (int certified = 0; certified < 2; certified++) {
+        dist_render_desc how = plain_how();
+        how.certified = certified;
+        for (int k = 0; k < CASES; k++) {
+            test_shape shape = cases[k].shape;
+            dist_field field = shape_field(&shape, cases[k].radius, cases[k].lipschitz);
+            CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, &how, &picture_a), ctx);
+            CHECK_NEAR(0, picture_a.stats.steepest, 0);
+        }
+        const double amplitude[3] = {0.02, 0.05, 0.1}, slope[3] = {1, 1, 2.5}; /* stiff: slopes to 1 + 80 amplitude */
+        for (int k = 0; k < 3; k++) {
+            test_shape shape = shape_make(SHAPE_BUMPY, 0.6, amplitude[k], 80, 0);
+            shape.slope = slope[k];
+            double most = slope[k] * (1 + 80 * amplitude[k]);
+            dist_field field = shape_field(&shape, 1, 1.125);
+            CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, &how, &picture_a), ctx);
+            CHECK((double)picture_a.stats.steepest > 1.125 && (double)picture_a.stats.steepest <= 1.001 * most);
+            if (test_state.verbose)
+                printf("    slope %.2f: figure 1.125, met %.3f\n", most, (double)picture_a.stats.steepest);
+            how.lipschitz = (float)(1.001 * most);
+            CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, &how, &picture_a), ctx);
+            CHECK_NEAR(0, picture_a.stats.steepest, 0);
+            how.lipschitz = 0;
+        }
+    }
+    dist_context_destroy(ctx);
+}
+
+/* Sampled 1.125: certified rays meet more, and say so. */
+TEST(slopes_of_rings_beyond_those_sampled_are_reported)
+{
+    dist_context *ctx = shape_context();
+    const char *path = test_data_path("nets/rings.safetensors");
+    FILE *file = fopen(path, "rb");
+    if (!file) dist_context_destroy(ctx);
+    if (!file) SKIP("no ../shared/data");
+    fclose(file);
+    dist_camera camera = shape_camera(SIDE, SIDE);
+    dist_net *net = dist_net_load_file(ctx, path);
+    dist_shape *shape = dist_shape_create(ctx, net, NULL);
+    dist_field field = dist_shape_field(shape);
+    dist_render_desc how = plain_how();
+    how.certified = 1;
+    CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, &how, &picture_a), ctx);
+    CHECK(picture_a.stats.steepest > picture_a.stats.lipschitz);
+    if (test_state.verbose)
+        printf("    sampled %.3f and %.3f, met %.3f\n", (double)field.lipschitz, (double)field.lipschitz_far,
+               (double)picture_a.stats.steepest);
+    dist_shape_destroy(shape);
+    dist_net_destroy(net);
+    dist_context_destroy(ctx);
+}
+
 TEST(error_bounds_hold_for_999_hits_of_1000)
 {
     dist_context *ctx = shape_context();
@@ -1300,6 +1360,8 @@ int main(int argc, char **argv)
     RUN(trace_refuses_what_it_cannot_trace);
     RUN(each_row_of_the_ladder_asks_less_than_the_one_before);
     RUN(the_paper_converges_up_to_slope_1_2_and_not_from_1_34_on);
+    RUN(a_slope_beyond_the_lipschitz_figure_is_reported);
+    RUN(slopes_of_rings_beyond_those_sampled_are_reported);
     RUN(error_bounds_hold_for_999_hits_of_1000);
     RUN(error_bounds_hold_for_999_hits_of_1000_of_real_decoders);
     RUN(depth_of_real_decoders_is_that_of_double);

@@ -258,6 +258,7 @@ static unsigned long long march_once(dist_context *ctx, double angle, int trace,
     how.step_scale = (float)alpha;
     how.epsilon = MARCH_EPSILON;
     how.max_steps = 1000;
+    how.no_cones = 1; /* they are for pictures: here is one ray */
     out.distance = &distance;
     out.stats = &stats;
     dist_render(ctx, &field, &camera, &how, &out, NULL);

@@ -6,7 +6,9 @@
    multiply-add peak measured in the same run with the same threads: the paper's step, had its arithmetic been done at
    full speed. mode cold: every picture traced anew; warm: each
    starts from the last one; frame: depth, normals and mask, no gradient.
-   bytes: most memory held beside the caller's planes and the weights. moved: mean change of depth of a step, in radii.
+   bytes: most memory held beside the caller's planes and the weights. moved: mean change of depth of a step, in radii;
+   in the warm rows Adam's rate is lowered until that is at most 5e-4. render, backward: seconds of these parts;
+   their rates: dense multiply-adds (backward: a forward and a reverse pass a point) at the peak, over the time.
    The camera is 2.2 radii away with a focal length of 385 pixels at 512, as in bench_trace. */
 #define DIST_IMPLEMENTATION
 #include "../dist.h"
@@ -19,7 +21,7 @@ static const char usage[] =
     "  --case NAME        only this one\n"
     "  --size N           pixels along a side of the steps (default 512)\n"
     "  --steps N          measured steps of a fit (default 12)\n"
-    "  --rate R           Adam's (default 0.001)\n"
+    "  --rate R           Adam's, at first (default 0.001)\n"
     "  --threads N        threads (default all)\n"
     "  --quick            128 pixels, few cases\n";
 
@@ -42,6 +44,7 @@ static const step_case cases[] = {
 
 enum { CASES = sizeof cases / sizeof cases[0], STEPS_MOST = 1000 };
 static const double PAPER_QUERIES = 887000;
+static const double MOVED_MOST = 5e-4; /* radii a step in the warm rows */
 
 typedef struct settings {
     const char *only;
@@ -173,8 +176,8 @@ static void stepper_destroy(stepper *s)
     free(s->adam.moments);
 }
 
-/* One step; its seconds. */
-static double step_once(stepper *s)
+/* One step; its seconds, and those of the render and the backward pass. */
+static double step_once(stepper *s, double *render, double *backward)
 {
     dist_gradients grads;
     memset(&grads, 0, sizeof grads);
@@ -185,11 +188,15 @@ static double step_once(stepper *s)
     memset(s->d_out.silhouette, 0, s->n * sizeof(float));
     memset(s->d_code, 0, s->code_size * sizeof(float));
     dist_shape_set_code(s->shape, s->code);
+    double render_start = seconds_now();
     dist_render(s->ctx, &s->field, &s->camera, &s->how, &s->out, s->tape);
+    *render = seconds_now() - render_start;
     dist_loss_depth(s->n, s->out.depth, s->target, s->out.mask, 10.0f, s->d_out.depth);
     dist_loss_silhouette(s->n, s->out.silhouette, s->target_mask, 1.0f, s->d_out.silhouette);
     dist_loss_code(s->code_size, s->code, 1.0f / (float)s->code_size, s->d_code);
+    double backward_start = seconds_now();
     dist_render_backward(s->ctx, s->tape, &s->d_out, &grads);
+    *backward = seconds_now() - backward_start;
     dist_adam_step(&s->adam, s->code_size, s->code, s->d_code);
     check(s->ctx);
     return seconds_now() - start;
@@ -211,21 +218,24 @@ static double step_moved(stepper *s)
 }
 
 typedef struct row {
-    double seconds, queries, backward_points, peak, moved, hits;
+    double seconds, queries, backward_points, peak, moved, hits, render, backward, dense, rate;
 } row;
 
 /* The median of `steps` steps, after one that is not counted. */
 static row run_steps(stepper *s, int steps)
 {
     static double seconds[STEPS_MOST], queries[STEPS_MOST], points[STEPS_MOST], moved[STEPS_MOST], peaks[STEPS_MOST];
-    double taken;
+    static double renders[STEPS_MOST], backwards[STEPS_MOST];
+    double taken, render, backward;
     row r;
     memset(&r, 0, sizeof r);
     for (int i = -1; i < steps; i++) {
-        double once = step_once(s);
+        double once = step_once(s, &render, &backward);
         double change = step_moved(s);
         if (i < 0) { continue; }
         seconds[i] = once;
+        renders[i] = render;
+        backwards[i] = backward;
         queries[i] = (double)s->stats.queries;
         points[i] = (double)s->stats.backward_points;
         moved[i] = change;
@@ -236,7 +246,11 @@ static row run_steps(stepper *s, int steps)
     r.backward_points = median((size_t)steps, points);
     r.moved = median((size_t)steps, moved);
     r.peak = median((size_t)steps, peaks);
+    r.render = median((size_t)steps, renders);
+    r.backward = median((size_t)steps, backwards);
+    r.dense = r.queries > 0 ? s->stats.operations / (double)s->stats.queries : 0;
     r.hits = (double)s->stats.hits;
+    r.rate = (double)s->adam.rate;
     return r;
 }
 
@@ -246,9 +260,13 @@ static void print_row(const char *name, const char *mode, int width, int height,
     double whole = PAPER_QUERIES * 2.0 * operations / (r->peak * 1e9);
     char resolution[32];
     snprintf(resolution, sizeof resolution, width == height ? "%d" : "%dx%d", width, height);
-    printf("%s,%s,%s,%d,%.5f,%.0f,%.0f,%.1f,%.4f,%.0f,%.0f,%.2f,%.1e\n", name, mode, resolution,
+    double render_rate = r->render > 0 ? r->queries * 2.0 * r->dense / (r->render * r->peak * 1e9) : 0;
+    double backward_rate =
+        r->backward > 0 ? r->backward_points * 4.0 * r->dense / (r->backward * r->peak * 1e9) : 0;
+    printf("%s,%s,%s,%d,%.5f,%.0f,%.0f,%.1f,%.4f,%.0f,%.0f,%.2f,%.1e,%.5f,%.5f,%.2f,%.2f,%.1e\n", name, mode, resolution,
            dist_context_workers(ctx), r->seconds, r->queries, r->backward_points, r->peak, r->seconds / whole,
-           (double)bytes, r->hits, r->hits > 0 ? r->queries / r->hits : 0, r->moved);
+           (double)bytes, r->hits, r->hits > 0 ? r->queries / r->hits : 0, r->moved,
+           r->render, r->backward, render_rate, backward_rate, r->rate);
     fflush(stdout);
 }
 
@@ -259,9 +277,16 @@ static void run_case(dist_context *ctx, const step_case *c, const settings *set,
     if (!net) { return; }
     size_t weights = memory->held - before;
     for (int warm = 0; warm < 2; warm++) {
+        float rate = set->rate;
         memory->most = memory->held;
-        stepper s = stepper_create(ctx, net, c->code, set->size, set->rate, warm);
+        stepper s = stepper_create(ctx, net, c->code, set->size, rate, warm);
         row r = run_steps(&s, set->steps);
+        for (int i = 0; warm && i < 12 && r.moved > MOVED_MOST; i++) { /* about proportional to the rate */
+            rate *= (float)fmin(0.5, 0.9 * MOVED_MOST / r.moved);
+            stepper_destroy(&s);
+            s = stepper_create(ctx, net, c->code, set->size, rate, warm);
+            r = run_steps(&s, set->steps);
+        }
         print_row(c->name, warm ? "warm" : "cold", set->size, set->size, ctx, (double)dist_net_operations(net, 0), &r,
                   memory->most - weights);
         stepper_destroy(&s);
@@ -348,7 +373,7 @@ int main(int argc, char **argv)
     dist_context *ctx = dist_context_create(&desc);
     check(ctx);
     puts("case,mode,resolution,threads,seconds,queries,backward_points,peak_gflops,ratio,bytes,hits,"
-         "queries_per_hit,moved");
+         "queries_per_hit,moved,render,backward,render_rate,backward_rate,rate");
     for (int i = 0; i < CASES; i++) {
         int wanted = set.only ? strcmp(set.only, cases[i].name) == 0 : !set.quick || cases[i].quick;
         if (wanted) { run_case(ctx, &cases[i], &set, &memory); }

@@ -11548,6 +11548,23 @@ static void disti_add_pull(disti_render_backward_job *job, const double p[3], co
     }
 }
 
+/* Puts the entries in such order that the blocks of a field that likes many points hold neighbors. */
+static void disti_backward_sort(disti_render_backward_job *job)
+{
+    const dist_tape *tape = job->tape;
+    float *points = disti_chunk_scratch(job->ctx);
+    disti_entry *entry = (disti_entry *)(void *)(points + 3 * DISTI_CHUNK);
+    int *order = (int *)(void *)(entry + DISTI_CHUNK);
+    for (size_t i = 0; i < job->count; i++) order[i] = (int)i;
+    disti_sort_points(tape->points, order, 0, (int)job->count);
+    memcpy(points, tape->points, 3 * job->count * sizeof(float));
+    memcpy(entry, tape->entry, job->count * sizeof *entry);
+    for (size_t i = 0; i < job->count; i++) {
+        memcpy(tape->points + 3 * i, points + 3 * order[i], 3 * sizeof(float));
+        tape->entry[i] = entry[order[i]];
+    }
+}
+
 /* Runs the adjoint over the entries gathered so far. */
 static void disti_backward_flush(disti_render_backward_job *job)
 {
@@ -11558,6 +11575,7 @@ static void disti_backward_flush(disti_render_backward_job *job)
         void *out; /* the tape's work space is written through it */
     } user;
     if (job->count == 0) return;
+    if (field->many) disti_backward_sort(job);
     user.in = tape;
     memset(tape->d_points, 0, 3 * job->count * sizeof(float));
     disti_field_backward_all(job->ctx, field, job->count, tape->points, tape->d_sdf, disti_render_seed, user.out,

@@ -6172,7 +6172,7 @@ static int disti_group_eval(const dist_shape *shape, int worker, disti_group *g,
     return 1;
 }
 
-/* f at n points, in groups of neighbors. */
+/* f at n points, in the order of neighbors: blocks of these share dead units; many, in groups. */
 static void disti_groups_eval(void *user, int worker, size_t n, const float *points, float *sdf)
 {
     const dist_shape *shape = (const dist_shape *)user;
@@ -6189,7 +6189,8 @@ static void disti_groups_eval(void *user, int worker, size_t n, const float *poi
             int part = DISTI_MIN(count - first, (int)DISTI_GROUP_POINTS);
             for (int i = 0; i < part; i++)
                 memcpy(g.points + 3 * i, points + 3 * (at + (size_t)g.order[first + i]), 3 * sizeof(float));
-            if (part <= DISTI_BLOCK || !disti_group_eval(shape, worker, &g, &b, part, g.points, value))
+            int few = n <= 2 * DISTI_GROUP_POINTS || part <= 2 * DISTI_BLOCK; /* bounds would cost more than they save */
+            if (few || !disti_group_eval(shape, worker, &g, &b, part, g.points, value))
                 disti_shape_fused(user, worker, (size_t)part, g.points, value, NULL, NULL, NULL, NULL);
             for (int i = 0; i < part; i++) sdf[at + (size_t)g.order[first + i]] = value[i];
         }
@@ -6200,7 +6201,7 @@ static void disti_shape_eval_fn(void *user, int worker, size_t n, const float *p
 {
     const dist_shape *shape = (const dist_shape *)user;
     if (!gradient && disti_wide_floats(shape->ctx, shape->net) > 0) disti_wide_eval(shape, worker, n, points, sdf);
-    else if (!gradient && shape->groups && n > DISTI_GROUP_POINTS) disti_groups_eval(user, worker, n, points, sdf);
+    else if (!gradient && shape->groups && n > DISTI_BLOCK) disti_groups_eval(user, worker, n, points, sdf);
     else disti_shape_fused(user, worker, n, points, sdf, gradient, NULL, NULL, NULL);
 }
 

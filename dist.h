@@ -6189,7 +6189,7 @@ static void disti_groups_eval(void *user, int worker, size_t n, const float *poi
             int part = DISTI_MIN(count - first, (int)DISTI_GROUP_POINTS);
             for (int i = 0; i < part; i++)
                 memcpy(g.points + 3 * i, points + 3 * (at + (size_t)g.order[first + i]), 3 * sizeof(float));
-            int few = n <= 2 * DISTI_GROUP_POINTS || part <= 2 * DISTI_BLOCK; /* bounds would cost more than they save */
+            int few = n <= 2 * DISTI_GROUP_POINTS || part <= 2 * DISTI_BLOCK; /* bounds cost more than they save */
             if (few || !disti_group_eval(shape, worker, &g, &b, part, g.points, value))
                 disti_shape_fused(user, worker, (size_t)part, g.points, value, NULL, NULL, NULL, NULL);
             for (int i = 0; i < part; i++) sdf[at + (size_t)g.order[first + i]] = value[i];

@@ -2006,6 +2006,7 @@ DISTI_PLAIN(scalar, static)
      DISTI_RELU(v) DISTI_POSITIVE(v)    max(v, 0), and the bits of the lanes that are greater than 0
      DISTI_BITS(row, column, v)         the latter into a mask's row, from this column on
      DISTI_KEEP(v, bits)                v with 0 where the lane's bit is 0
+     DISTI_TALL(isa)                    tiles of one vector's columns, where there are registers for sixteen rows
      DISTI_DEPTH                        rows that one pass takes: 112 of 192 bytes stay in a first cache of 32 KiB
                                         beside the weights; wider vectors ask for less and can use the second cache
    A tile of R rows and V vectors keeps its sums in variables a<row><vector>: gcc holds those in registers where it
@@ -2022,6 +2023,7 @@ DISTI_PLAIN(scalar, static)
 #define DISTI_Y1(M, V) M(0, V)
 #define DISTI_Y4(M, V) M(0, V) M(1, V) M(2, V) M(3, V)
 #define DISTI_Y8(M, V) DISTI_Y4(M, V) M(4, V) M(5, V) M(6, V) M(7, V)
+#define DISTI_Y16(M, V) DISTI_Y8(M, V) M(8, V) M(9, V) M(10, V) M(11, V) M(12, V) M(13, V) M(14, V) M(15, V)
 
 #define DISTI_ZERO1(i, j) DISTI_VEC a##i##j = DISTI_SET1(0.0f);
 #define DISTI_AGAIN1(i, j) a##i##j = DISTI_LOAD(y + i * DISTI_BLOCK + j * DISTI_LANES);
@@ -2031,6 +2033,7 @@ DISTI_PLAIN(scalar, static)
 #define DISTI_INPUT(i, j) const DISTI_VEC x##j = DISTI_LOAD(xs + j * DISTI_LANES);
 #define DISTI_MAC(i, j) DISTI_FMA(a##i##j, b, x##j);
 #define DISTI_SIDE(i, V) { const DISTI_VEC b = DISTI_SET1(ws[i]); DISTI_X##V(DISTI_MAC, i) }
+#define DISTI_ABOVE(i, V) { const DISTI_VEC b = DISTI_SET1(ws[(i) / 8 * panel + (i) % 8]); DISTI_X##V(DISTI_MAC, i) }
 #define DISTI_APART(i, V) { const DISTI_VEC b = DISTI_SET1(ws[k##i]); DISTI_X##V(DISTI_MAC, i) }
 #define DISTI_STEP(R, V, FACTORS, w, x) \
     { const float *const ws = w, *const xs = x; DISTI_X##V(DISTI_INPUT, 0) DISTI_Y##R(FACTORS, V) DISTI_FENCE }
@@ -2065,7 +2068,7 @@ DISTI_PLAIN(scalar, static)
 
 /* Takes inputs from..to-1 of the list or of all; between two passes over DISTI_DEPTH rows the sums wait in y.
    Weights are fetched `ahead` floats early: a little, or a whole panel where passes cut the panels. */
-#define DISTI_GEMM_TILE(name, R, V)                                                                                    \
+#define DISTI_GEMM_TILE(name, R, V, FACTORS)                                                                           \
     DISTI_NOINLINE DISTI_FUNCTION void disti_gemm_##name(const disti_gemm *g, int o, int c, int from, int to,          \
                                                           size_t ahead)                                                \
     {                                                                                                                  \
@@ -2082,7 +2085,8 @@ DISTI_PLAIN(scalar, static)
             for (const int *alive = g->alive + from, *end = g->alive + to; alive < end; alive++) {                     \
                 const size_t k = (size_t)(unsigned)*alive;                                                             \
                 DISTI_AHEAD(w + k * 8, ahead);                                                                         \
-                DISTI_STEP(R, V, DISTI_SIDE, w + k * 8, x + k * DISTI_BLOCK)                                           \
+                if (R > 8) DISTI_AHEAD(w + panel + k * 8, ahead);                                                      \
+                DISTI_STEP(R, V, FACTORS, w + k * 8, x + k * DISTI_BLOCK)                                              \
             }                                                                                                          \
         } else {                                                                                                       \
             const float *end = w + (size_t)(unsigned)to * 8;                                                           \
@@ -2090,10 +2094,11 @@ DISTI_PLAIN(scalar, static)
             x += (size_t)(unsigned)from * DISTI_BLOCK;                                                                 \
             for (; DISTI_UNROLLED && end - w >= 2 * 8; w += 2 * 8, x += 2 * DISTI_BLOCK) {                             \
                 DISTI_AHEAD(w, ahead);                                                                                 \
-                DISTI_STEP(R, V, DISTI_SIDE, w, x)                                                                     \
-                DISTI_STEP(R, V, DISTI_SIDE, w + 8, x + DISTI_BLOCK)                                                   \
+                if (R > 8) DISTI_AHEAD(w + panel, ahead);                                                              \
+                DISTI_STEP(R, V, FACTORS, w, x)                                                                        \
+                DISTI_STEP(R, V, FACTORS, w + 8, x + DISTI_BLOCK)                                                      \
             }                                                                                                          \
-            for (; w < end; w += 8, x += DISTI_BLOCK) DISTI_STEP(R, V, DISTI_SIDE, w, x)                               \
+            for (; w < end; w += 8, x += DISTI_BLOCK) DISTI_STEP(R, V, FACTORS, w, x)                                  \
         }                                                                                                              \
         if (to < (g->alive ? g->alive_count : g->rows)) {                                                              \
             DISTI_Y##R(DISTI_STORE_PART, V)                                                                            \
@@ -2248,8 +2253,8 @@ DISTI_PLAIN(scalar, static)
     }
 
 /* All tiles of `total` rows, eight at a time: their strips are R rows high where W vectors wide, else eight. */
-#define DISTI_EACH(kernel, isa, total, columns, R, W, arguments)                                                       \
-    for (int row = 0; row < (total); row += 8) {                                                                       \
+#define DISTI_EACH(kernel, isa, first, total, columns, R, W, arguments)                                                \
+    for (int row = first; row < (total); row += 8) {                                                                   \
         for (int c = 0; c < (columns); c += W * DISTI_LANES) {                                                         \
             const int vectors = DISTI_VECTORS((columns) - c);                                                          \
             for (int n = row; n < row + 8 && n < (total); n += vectors >= W ? R : 8) {                                 \
@@ -2269,7 +2274,9 @@ DISTI_PLAIN(scalar, static)
         do {                                                                                                           \
             const int from = to;                                                                                       \
             to = DISTI_MIN(from + DISTI_DEPTH, count);                                                                 \
-            DISTI_EACH(gemm, isa, out, g->columns, R, W, (g, n, c, from, to, ahead))                                   \
+            int first = 0;                                                                                             \
+            DISTI_TALL(isa)                                                                                            \
+            DISTI_EACH(gemm, isa, first, out, g->columns, R, W, (g, n, c, from, to, ahead))                            \
         } while (to < count);                                                                                          \
         if (!g->mask || g->columns == DISTI_BLOCK) return;                                                             \
         for (int o = 0; o < out; o++) g->mask[o] &= ((uint64_t)1 << g->columns) - 1;                                   \
@@ -2282,7 +2289,8 @@ DISTI_PLAIN(scalar, static)
         do {                                                                                                           \
             const int from = to;                                                                                       \
             to = DISTI_MIN(from + DISTI_DEPTH, count);                                                                 \
-            DISTI_EACH(back, isa, rows, g->columns, R, W, (g, disti_back_rows(g, rows, n, k), rows - n, c, from, to))  \
+            DISTI_EACH(back, isa, 0, rows, g->columns, R, W,                                                           \
+                       (g, disti_back_rows(g, rows, n, k), rows - n, c, from, to))                                     \
         } while (to < count);                                                                                          \
     }                                                                                                                  \
     DISTI_FUNCTION void disti_gemm_weights_##isa(const disti_gemm_weights *g)                                          \
@@ -2299,7 +2307,7 @@ DISTI_PLAIN(scalar, static)
                     memcpy(packed + c * x_stride, x + c * g->xt_stride, bytes);                                        \
                 x = packed;                                                                                            \
             }                                                                                                          \
-            DISTI_EACH(weights, isa, g->out, floats, R, W, (g, n, k, x, x_stride))                                     \
+            DISTI_EACH(weights, isa, 0, g->out, floats, R, W, (g, n, k, x, x_stride))                                  \
         }                                                                                                              \
     }
 
@@ -2333,9 +2341,9 @@ DISTI_PLAIN(scalar, static)
     }
 
 #define DISTI_KERNELS(isa, R, W)                                                                                       \
-    DISTI_GEMM_TILE(wide_##isa, R, W)                                                                                  \
-    DISTI_GEMM_TILE(middle_##isa, 8, 2)                                                                                \
-    DISTI_GEMM_TILE(narrow_##isa, 8, 1)                                                                                \
+    DISTI_GEMM_TILE(wide_##isa, R, W, DISTI_SIDE)                                                                      \
+    DISTI_GEMM_TILE(middle_##isa, 8, 2, DISTI_SIDE)                                                                    \
+    DISTI_GEMM_TILE(narrow_##isa, 8, 1, DISTI_SIDE)                                                                    \
     DISTI_BACK_TILE(wide_##isa, R, W)                                                                                  \
     DISTI_BACK_TILE(middle_##isa, 8, 2)                                                                                \
     DISTI_BACK_TILE(narrow_##isa, 8, 1)                                                                                \
@@ -2377,6 +2385,7 @@ DISTI_FUNCTION __m128 disti_keep_sse2(__m128 v, int bits)
     const __m128i lane = _mm_setr_epi32(1, 2, 4, 8);
     return _mm_and_ps(v, _mm_castsi128_ps(_mm_cmpeq_epi32(_mm_and_si128(_mm_set1_epi32(bits), lane), lane)));
 }
+#define DISTI_TALL(isa)
 #define DISTI_DEPTH 112
 DISTI_KERNELS(sse2, 4, 2)
 #define DISTI_ABS(v) _mm_andnot_ps(_mm_set1_ps(-0.0f), v)
@@ -2423,6 +2432,7 @@ DISTI_KERNELS(avx2, 4, 3)
 #define DISTI_ABS(v) _mm256_andnot_ps(_mm256_set1_ps(-0.0f), v)
 DISTI_BOUND(avx2)
 #undef DISTI_ABS
+#undef DISTI_TALL
 #undef DISTI_FUNCTION
 #undef DISTI_VEC
 #undef DISTI_LANES
@@ -2456,7 +2466,13 @@ DISTI_BOUND(avx2)
     { const __mmask16 m = DISTI_POSITIVE(v); memcpy((char *)(row) + (column) / 8, &m, sizeof m); }
 #define DISTI_KEEP(v, bits) _mm512_maskz_mov_ps((__mmask16)((bits) & 0xffff), v)
 #define DISTI_DEPTH 512
+/* Eight sums are too few to hide the latency of a multiply-add. */
+#define DISTI_TALL(isa)                                                                                                \
+    for (; g->columns <= DISTI_LANES && first + 16 <= out; first += 16)                                                \
+        disti_gemm_tall_##isa(g, first, 0, from, to, ahead);
+DISTI_GEMM_TILE(tall_avx512, 16, 1, DISTI_ABOVE)
 DISTI_KERNELS(avx512, 8, 3)
+#undef DISTI_TALL
 
 #ifdef DISTI_HALF
 /* A hidden layer in 16 bits: f16 by AVX512-FP16, or pairs of inputs by AVX512-BF16, from one text as above. A vector's
@@ -2676,6 +2692,7 @@ static float32x4_t disti_keep_neon(float32x4_t v, uint32_t bits)
     static const uint32_t lane[4] = {1, 2, 4, 8};
     return vreinterpretq_f32_u32(vandq_u32(vreinterpretq_u32_f32(v), vtstq_u32(vdupq_n_u32(bits), vld1q_u32(lane))));
 }
+#define DISTI_TALL(isa)
 #define DISTI_DEPTH 112
 DISTI_KERNELS(neon, 8, 3)
 #define DISTI_ABS(v) vabsq_f32(v)
@@ -2737,6 +2754,7 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_Y1
 #undef DISTI_Y4
 #undef DISTI_Y8
+#undef DISTI_Y16
 #undef DISTI_ZERO1
 #undef DISTI_AGAIN1
 #undef DISTI_ZERO
@@ -2745,6 +2763,7 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_MAC
 #undef DISTI_SIDE
 #undef DISTI_APART
+#undef DISTI_ABOVE
 #undef DISTI_STEP
 #undef DISTI_FENCE
 #undef DISTI_UNROLLED
@@ -2795,6 +2814,7 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_POSITIVE
 #undef DISTI_BITS
 #undef DISTI_KEEP
+#undef DISTI_TALL
 #undef DISTI_DEPTH
 #undef DISTI_MAC_LANE
 #undef DISTI_TABLE

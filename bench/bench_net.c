@@ -7,7 +7,9 @@
    backward_code: that and the code's gradient. f16, bf16, and f16_dead, bf16_dead: the hidden layers in 16 bits, where
    the processor has the instructions, against the peak of those; max_error and rms_error are against f32. gflops counts
    the forward pass alone in all modes; of_forward is the time in f32 forward passes; executed is the share of the
-   forward multiply-adds that was done. */
+   forward multiply-adds that was done. speedup, in f32 rows of several threads: their rate over that of one thread,
+   and peak_speedup the same of the peak loop, which says what the machine gives; one thread and all of them take turns,
+   by the clock, the fastest of each, since what else runs costs several threads more than one; 0 in other rows. */
 #define DIST_IMPLEMENTATION
 #include "../dist.h"
 #include "../examples/common.h"
@@ -47,6 +49,7 @@ typedef struct settings {
 
 typedef struct work {
     dist_context *ctx;
+    int wall; /* by the clock, also with one thread */
     dist_field field, half[2]; /* half: in f16 and bf16; without eval_fn: not here */
     size_t batch;
     const float *points;
@@ -75,14 +78,23 @@ static void work_once(const work *w, int mode)
     }
 }
 
-/* Seconds of one pass, over as many as fill `seconds`. */
+/* Seconds of one pass, the mean of several. */
 static double work_time(const work *w, int mode, int passes)
 {
-    double start = now_of(w->ctx);
+    double start = w->wall ? seconds_now() : now_of(w->ctx);
     for (int i = 0; i < passes; i++) {
         work_once(w, mode);
     }
-    return (now_of(w->ctx) - start) / passes;
+    return ((w->wall ? seconds_now() : now_of(w->ctx)) - start) / passes;
+}
+
+/* GFLOP/s of the peak loop in f32, by the clock. */
+static double peak_wall(const work *w, long loops)
+{
+    double taken = 0;
+    double start = seconds_now();
+    double rate = peak_once(w->ctx, loops, &taken);
+    return rate * taken / (seconds_now() - start);
 }
 
 /* Share of the multiply-adds that were not left out as dead units, of one forward pass over the batch. */
@@ -108,12 +120,15 @@ static int has_mode(const work *w, int mode)
     return mode < F16 || w->half[mode - F16].eval_fn;
 }
 
-/* Measures the modes of one net in turn with the peaks of their instructions, several times, and prints a row each. */
-static void measure(const settings *s, const char *name, const work *w, int dead)
+/* Measures the modes of one net in turn with the peaks of their instructions, several times, and prints a row each.
+   one: the same with one thread, or NULL */
+static void measure(const settings *s, const char *name, const work *w, const work *one, int dead)
 {
     static const char *const names[2][MODES] = {{"dense", "backward", "backward_code", "f16", "bf16"},
                                                 {"dead", "backward", "backward_code", "f16_dead", "bf16_dead"}};
     static double peaks[3][REPETITIONS_MAX], times[MODES][REPETITIONS_MAX]; /* peaks: f32, f16, bf16 */
+    double fastest[2][MODES] = {{0}}; /* passes a second, of one thread and of all */
+    double highest[2] = {0, 0};
     static const int halves[3] = {DIST_HALF_OFF, DIST_HALF_F16, DIST_HALF_BF16};
     double length = s->quick ? 0.004 : 0.02;
     int passes[MODES];
@@ -135,6 +150,14 @@ static void measure(const settings *s, const char *name, const work *w, int dead
         for (int m = 0; m < MODES; m++) {
             if (has_mode(w, m)) { times[m][r] = work_time(w, m, passes[m]); }
         }
+        for (int side = 0; side < (one ? 2 : 0); side++) {
+            highest[side] = fmax(highest[side], peak_wall(side ? w : one, loops));
+            for (int m = 0; m < F16; m++) {
+                if (!has_mode(w, m)) { continue; }
+                double seconds = side ? times[m][r] : work_time(one, m, passes[m]);
+                fastest[side][m] = fmax(fastest[side][m], 1 / (seconds + 1e-9));
+            }
+        }
     }
     check(w->ctx);
     double share = s->best ? 0.0 : 0.5;
@@ -153,10 +176,11 @@ static void measure(const settings *s, const char *name, const work *w, int dead
             largest = e > largest ? e : largest;
             squares += e * e;
         }
-        printf("%s,%s,%d,%.0f,%.6f,%.0f,%.1f,%.1f,%.3f,%s,%.2f,%.3f,%.3g,%.3g\n", name,
+        double speedup = one && m < F16 ? fastest[1][m] / fastest[0][m] : 0;
+        printf("%s,%s,%d,%.0f,%.6f,%.0f,%.1f,%.1f,%.3f,%s,%.2f,%.3f,%.3g,%.3g,%.3f,%.3f\n", name,
                dist_isa_name(dist_context_isa(w->ctx)), dist_context_workers(w->ctx), (double)w->batch, seconds, rate,
                gflops, peak, gflops / peak, names[dead][m], seconds / forward, executed, largest,
-               sqrt(squares / (double)w->batch));
+               sqrt(squares / (double)w->batch), speedup, speedup > 0 ? highest[1] / highest[0] : 0);
     }
     fflush(stdout);
 }
@@ -265,7 +289,16 @@ static void measure_net(const settings *s, const net_case *c, int isa, int threa
         w.half[k] = dist_shape_field(shapes[k]);
         w.half[k].eval_fn = w.half[k].coarse_fn;
     }
-    measure(s, c ? c->name : s->model, &w, !c);
+    work one = w;
+    desc.workers = 1;
+    one.wall = 1;
+    one.ctx = threads > 1 ? dist_context_create(&desc) : NULL;
+    dist_shape *alone = threads > 1 ? dist_shape_create(one.ctx, net, code) : NULL;
+    if (alone) { one.field = dist_shape_field(alone); }
+    if (one.ctx) { check(one.ctx); }
+    measure(s, c ? c->name : s->model, &w, alone ? &one : NULL, !c);
+    dist_shape_destroy(alone);
+    dist_context_destroy(one.ctx);
     for (int k = 0; k < 2; k++) {
         dist_shape_destroy(shapes[k]);
         dist_net_destroy(halves[k]);
@@ -317,7 +350,7 @@ int main(int argc, char **argv)
     most = s.quick ? 1 : s.threads;
 #endif
     puts("case,isa,threads,batch,seconds,queries_per_s,gflops,peak_gflops,share,mode,of_forward,executed,max_error,"
-         "rms_error");
+         "rms_error,speedup,peak_speedup");
     for (int i = 0; i < (s.model ? 1 : (int)CASES); i++) {
         const net_case *c = s.model ? NULL : &cases[i];
         if (c && s.only_case && strcmp(s.only_case, c->name) != 0) { continue; }

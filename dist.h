@@ -9724,13 +9724,18 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
 /* What the neighbors say about the error bounds of hits, in the end. Behind a nearer neighbor, across a step in depth,
    the nearer surface may go on in front of the hit, as the Lipschitz figure is an estimate: the bound reaches to there.
    A predicted hit may be off by what it differs from the cubic through its neighbors, (-1, 4, 4, -1) / 6, or from their
-   mean if that is less: where the surface is smooth, next to nothing. */
-static void disti_trace_doubt(const disti_tile *tile, const disti_bench *bench)
+   mean if that is less: where the surface is smooth, next to nothing. Where f hardly falls at the hit it may have been
+   flat before, and have crossed 0 within the band's 4 epsilon: the bound reaches as far as that takes at this slope. */
+static void disti_trace_doubt(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench)
 {
     for (int i = 0; i < tile->width * tile->height; i++) {
         disti_ray *ray = &bench->rays[i];
         float z = disti_hit_depth(ray, 0, 1, 0, 0), doubt = 0.0f;
         if (!(z > 0.0f)) continue;
+        float falls = ray->slope < 0.0f ? -ray->slope : ray->slope, most = 0.02f * tracer->field->radius;
+        float flat = 4.0f * disti_ray_epsilon(tracer, ray, ray->best);
+        if (falls < 0.04f * tracer->lipschitz && ray->sign > 0.0f)
+            ray->error = DISTI_MAX(ray->error, flat < most * falls ? flat / falls : most);
         for (int axis = 0; axis < 2; axis++) {
             int at = axis ? i / tile->width : i % tile->width, end = axis ? tile->height : tile->width;
             int stride = axis ? tile->width : 1;
@@ -11276,7 +11281,7 @@ static void disti_render_task(void *arg, int index, int worker)
         if (job->predict) disti_trace_lattice(tracer, worker, &tile, &bench);
         else disti_trace_all(tracer, worker, &bench, (size_t)n);
         if (!tracer->how.certified && (job->out->error || job->out->stats))
-            disti_trace_doubt(&tile, &bench);
+            disti_trace_doubt(tracer, &tile, &bench);
         budget.marching = 0;
         disti_tile_trim(job, &tile, &bench);
         disti_trace_end(tracer, &bench, (size_t)(tile.width * tile.height));

@@ -8,7 +8,7 @@
 #include "model.h"
 #include <stdio.h>
 
-enum { W = 128, H = 128, CODE = 32, STEPS = 20, ARENA = 3 << 20 };
+enum { W = 128, H = 128, CODE = 32, STEPS = 20, ARENA = 4 << 20 };
 static unsigned char memory[ARENA + 63];
 static float depth[W * H], d_depth[W * H], observed[W * H];
 static unsigned char mask[W * H];

@@ -216,6 +216,7 @@ typedef struct dist_field {
     float lipschitz_far; /* the same where f is larger; 0: lipschitz */
     float clamp;     /* |f| above this carries no distance (a clamped training); 0: none */
     float detail;    /* the radius that the defaults of how.epsilon and normal_delta go by; 0: radius */
+    float cost;      /* multiply-adds of a query, about: dear ones are saved by more bookkeeping; 0: dear */
     int kinks;       /* 1: grad f jumps (ReLU), which second_fn leaves out: a normal's gradient is by differences */
     int many;        /* 1: eval_fn is the faster the more points it gets at once, up to thousands */
     int code_size;   /* length of d_code */
@@ -3068,6 +3069,9 @@ static dist_status disti_field_check(dist_context *ctx, const dist_field *field,
     if (!disti_finite(field->clamp) || field->clamp < 0.0f)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.clamp is %d, must be 0 or positive", function,
                           (double)field->clamp, 0);
+    if (!disti_finite(field->cost) || field->cost < 0.0f)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.cost is %d, must be 0 or positive", function,
+                          (double)field->cost, 0);
     if (field->code_size < 0)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.code_size is %d, must not be negative", function,
                           field->code_size, 0);
@@ -6714,6 +6718,7 @@ DIST_API dist_field dist_shape_field(dist_shape *shape)
     field.lipschitz = shape->lipschitz;
     field.lipschitz_far = shape->lipschitz_far;
     field.clamp = net->clamp;
+    field.cost = (float)dist_net_operations(net, 1);
     field.kinks = net->activation == DIST_ACTIVATION_RELU;
     field.many = shape->groups;
     field.code_size = net->code_size;
@@ -8699,12 +8704,14 @@ typedef struct disti_bench { /* the work bench of one task */
     disti_ray *rays;   /* DISTI_TILE_RAYS */
     float *points;     /* (DISTI_TILE_RAYS, 3) */
     float *sdf;        /* DISTI_TILE_RAYS */
+    float *depth;      /* DISTI_TILE_RAYS: of the rays that are hits so far, for their neighbors; 0: none */
     int *index;        /* DISTI_TILE_RAYS */
     unsigned char *rest; /* what else a task wants: DISTI_REST_BYTES */
     disti_balls *balls;  /* NULL: rays do not share */
     disti_least *least_of;
     int width, height;   /* of the tile */
     float least;         /* smallest ball worth keeping */
+    int cones;           /* in rest, until something else is put there: the tile's */
 } disti_bench;
 
 enum { DISTI_REST_BYTES = 704 * 1024 };
@@ -8717,12 +8724,13 @@ static void disti_bench_init(const dist_context *ctx, int worker, disti_bench *b
     bench->rays = (disti_ray *)disti_take(base, &at, DISTI_TILE_RAYS, sizeof(disti_ray));
     bench->points = (float *)disti_take(base, &at, DISTI_TILE_RAYS, 3 * sizeof(float));
     bench->sdf = (float *)disti_take(base, &at, DISTI_TILE_RAYS, sizeof(float));
+    bench->depth = (float *)disti_take(base, &at, DISTI_TILE_RAYS, sizeof(float));
     bench->index = (int *)disti_take(base, &at, DISTI_TILE_RAYS, sizeof(int));
     bench->rest = (unsigned char *)disti_take(base, &at, DISTI_REST_BYTES, 1);
     bench->least_of = (disti_least *)disti_take(base, &at, 1, sizeof(disti_least));
     bench->balls = NULL;
     bench->budget = NULL;
-    bench->width = bench->height = 0;
+    bench->width = bench->height = bench->cones = 0;
     bench->least = 0.0f;
     DIST_ASSERT(at <= DISTI_TRACE_BYTES);
 }
@@ -8923,6 +8931,12 @@ DISTI_INLINE void disti_stats_slope(const disti_tracer *tracer, const disti_ray 
         stats->steepest = rise / step;
 }
 
+static float disti_hit_depth(const disti_ray *ray)
+{
+    if (ray->status != DIST_RAY_HIT || ray->mode != DISTI_DONE) return 0.0f;
+    return (float)(ray->base + (double)ray->best) * ray->cosine;
+}
+
 /* Marches the `active` rays listed in bench->index, in rounds: one packed batch of points a round, until only `enough`
    are left. Returns how many are still listed. Without budget they stay as they are: 0. */
 static size_t disti_trace_rounds(const disti_tracer *tracer, int worker, const disti_bench *bench, size_t active,
@@ -8945,8 +8959,12 @@ static size_t disti_trace_rounds(const disti_tracer *tracer, int worker, const d
             else bench->stats->march_queries++;
             if (bench->balls) disti_publish(tracer, bench, bench->index[i], bench->points + 3 * i, bench->sdf[i]);
             disti_stats_slope(tracer, ray, bench->sdf[i], bench->stats);
-            if (disti_ray_advance(tracer, ray, bench->sdf[i])) bench->index[kept++] = bench->index[i];
-            else if (bench->budget) bench->budget->hits += (unsigned)disti_ray_is_hit(tracer, ray);
+            if (disti_ray_advance(tracer, ray, bench->sdf[i])) {
+                bench->index[kept++] = bench->index[i];
+                continue;
+            }
+            bench->depth[bench->index[i]] = disti_hit_depth(ray);
+            if (bench->budget) bench->budget->hits += (unsigned)disti_ray_is_hit(tracer, ray);
         }
         if (asked < active) return 0;
         active = kept;
@@ -9385,7 +9403,8 @@ enum {
     DISTI_CONE_FIRST = 32,
     DISTI_CONE_LEAF = 4,
     DISTI_CONE_RAYS = 4, /* fewer march by themselves */
-    DISTI_CONES_MOST = 9 * (1 + 4 + 16 + 64)
+    DISTI_CONE_OUTLINE = 2, /* where the outline passes, if balls are not worth it */
+    DISTI_CONES_MOST = 9 * (1 + 4 + 16 + 64 + 256)
 };
 
 enum { DISTI_CONE_THROUGH, DISTI_CONE_BLOCKED, DISTI_CONE_SPLIT, DISTI_CONE_MARCHES };
@@ -9486,14 +9505,12 @@ static void disti_cone_finish(const disti_tracer *tracer, const disti_tile *tile
             bench->least_of->t[block] = (float)cone->least_t;
         }
     }
-    if (tile->lazy && cone->state == DISTI_CONE_THROUGH) return;
-    if (tile->lazy) disti_tile_rays(tracer, tile, bench, cone->x, cone->y, x1, y1);
     float axis[3], p[3];
     disti_cone_point(cone, axis);
     for (int y = cone->y; y < y1; y++) {
         for (int x = cone->x; x < x1; x++) {
             disti_ray *ray = &bench->rays[y * tile->width + x];
-            if (ray->mode == DISTI_DONE) continue;
+            if (ray->mode != DISTI_FIRST && ray->mode != DISTI_WAIT) continue;
             if (cone->state == DISTI_CONE_THROUGH || cone->t >= ray->base + (double)ray->leave) {
                 ray->mode = DISTI_DONE;
                 ray->status = DIST_RAY_MISS;
@@ -9524,17 +9541,25 @@ static void disti_cone_add(const disti_tracer *tracer, const disti_tile *tile, c
     (*count)++;
 }
 
-/* Blocks of 32, 16, 8 and so on to `leaf` pixels, all that are on their way in packed rounds. Returns how many blocks
-   are not seen to be empty. */
-static int disti_cones(const disti_tracer *tracer, int worker, const disti_tile *tile, const disti_bench *bench,
-                       int leaf)
+/* Adds the cones of a block's four quarters. */
+static void disti_cone_split(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench,
+                             disti_cone *cone, int *count, size_t *listed)
+{
+    int half = cone->size / 2;
+    cone->state = DISTI_CONE_SPLIT;
+    for (int k = 0; k < 4; k++) {
+        int x = cone->x + (k & 1 ? half : 0), y = cone->y + (k & 2 ? half : 0);
+        if (x < tile->own_width && y < tile->own_height)
+            disti_cone_add(tracer, tile, bench, x, y, cone, count, listed);
+    }
+}
+
+/* Marches the `active` cones listed in bench->index, and the parts that they fall into down to `leaf` pixels, all that
+   are on their way in packed rounds. */
+static void disti_cone_rounds(const disti_tracer *tracer, int worker, const disti_tile *tile, const disti_bench *bench,
+                              int *count, size_t active, int leaf)
 {
     disti_cone *cones = (disti_cone *)(void *)bench->rest;
-    size_t active = 0;
-    int count = 0, blocked = 0;
-    for (int y = 0; y < tile->own_height; y += DISTI_CONE_FIRST)
-        for (int x = 0; x < tile->own_width; x += DISTI_CONE_FIRST)
-            disti_cone_add(tracer, tile, bench, x, y, NULL, &count, &active);
     while (active > 0) {
         for (size_t i = 0; i < active; i++) disti_cone_point(&cones[bench->index[i]], bench->points + 3 * i);
         size_t asked = disti_query(tracer, worker, bench, active), all = active, kept = 0;
@@ -9543,22 +9568,36 @@ static int disti_cones(const disti_tracer *tracer, int worker, const disti_tile 
             disti_cone *cone = &cones[bench->index[i]];
             cone->state = i < asked ? disti_cone_advance(tracer, cone, bench->sdf[i]) : DISTI_CONE_BLOCKED;
             if (cone->state == DISTI_CONE_MARCHES) bench->index[kept++] = bench->index[i];
-            if (cone->state != DISTI_CONE_BLOCKED || i >= asked || cone->size == leaf) continue;
-            cone->state = DISTI_CONE_SPLIT;
-            for (int k = 0; k < 4; k++) {
-                int x = cone->x + (k & 1 ? cone->size / 2 : 0), y = cone->y + (k & 2 ? cone->size / 2 : 0);
-                if (x < tile->own_width && y < tile->own_height)
-                    disti_cone_add(tracer, tile, bench, x, y, cone, &count, &all);
-            }
+            if (cone->state == DISTI_CONE_BLOCKED && i < asked && cone->size > leaf)
+                disti_cone_split(tracer, tile, bench, cone, count, &all);
         }
         memmove(bench->index + kept, bench->index + active, (all - active) * sizeof(int));
         active = kept + all - active;
     }
-    for (int i = 0; i < count; i++) blocked += cones[i].state == DISTI_CONE_BLOCKED;
+}
+
+/* Blocks of 32, 16, 8 and so on to `leaf` pixels. Returns how many are not seen to be empty. */
+static int disti_cones(const disti_tracer *tracer, int worker, const disti_tile *tile, disti_bench *bench, int leaf)
+{
+    const disti_cone *cone = (disti_cone *)(void *)bench->rest;
+    size_t active = 0;
+    int blocked = 0;
+    for (int y = 0; y < tile->own_height; y += DISTI_CONE_FIRST)
+        for (int x = 0; x < tile->own_width; x += DISTI_CONE_FIRST)
+            disti_cone_add(tracer, tile, bench, x, y, NULL, &bench->cones, &active);
+    disti_cone_rounds(tracer, worker, tile, bench, &bench->cones, active, leaf);
+    for (int i = 0; i < bench->cones; i++) blocked += cone[i].state == DISTI_CONE_BLOCKED;
     if (tile->lazy && blocked == 0) return 0;
-    for (int i = 0; tile->lazy && i < tile->width * tile->height; i++) disti_ray_close(&bench->rays[i]);
-    for (int i = 0; i < count; i++)
-        if (cones[i].state != DISTI_CONE_SPLIT) disti_cone_finish(tracer, tile, bench, &cones[i]);
+    for (int i = 0; i < bench->cones; i++, cone++) {
+        int x1 = disti_block_end(cone->x, cone->size, tile->own_width, tile->width);
+        int y1 = disti_block_end(cone->y, cone->size, tile->own_height, tile->height);
+        if (cone->state == DISTI_CONE_SPLIT) continue;
+        if (tile->lazy && cone->state == DISTI_CONE_BLOCKED)
+            disti_tile_rays(tracer, tile, bench, cone->x, cone->y, x1, y1);
+        for (int y = cone->y; tile->lazy && cone->state == DISTI_CONE_THROUGH && y < y1; y++)
+            for (int x = cone->x; x < x1; x++) disti_ray_close(&bench->rays[y * tile->width + x]);
+        disti_cone_finish(tracer, tile, bench, cone);
+    }
     return blocked;
 }
 
@@ -9569,12 +9608,10 @@ static int disti_cones(const disti_tracer *tracer, int worker, const disti_tile 
    smaller than the predicted surface alone would make it, or something else is near. */
 enum { DISTI_LATTICE = 8 };
 
-/* z of a hit k h pixels along one axis; 0 where there is none. */
-static float disti_hit_depth(const disti_ray *ray, int at, int end, int shift, int stride)
+/* Depth of the hit `shift` pixels along one axis; 0 where there is none. */
+static float disti_depth_beside(const float *depth, int at, int end, int shift, int stride)
 {
-    const disti_ray *other = ray + shift * stride;
-    if (at + shift < 0 || at + shift >= end || other->status != DIST_RAY_HIT || other->mode != DISTI_DONE) return 0.0f;
-    return (float)(other->base + (double)other->best) * other->cosine;
+    return at + shift < 0 || at + shift >= end ? 0.0f : depth[shift * stride];
 }
 
 typedef struct disti_guess {
@@ -9586,15 +9623,16 @@ typedef struct disti_guess {
 
 /* Prediction along one axis of the picture from the hits at -3 h, -h, h, 3 h. Across an edge, where the hits at -h and
    h are a step apart, it is the farther surface, in case that the ray passes the nearer. */
-static disti_guess disti_predict_axis(const disti_tracer *tracer, const disti_ray *ray, int at, int end, int h,
-                                      int stride)
+static disti_guess disti_predict_axis(const disti_tracer *tracer, const disti_ray *ray, const float *depth, int at,
+                                      int end, int h, int stride)
 {
     disti_guess guess;
     memset(&guess, 0, sizeof guess);
     float near = 0.1f * tracer->field->radius;
-    float z1 = disti_hit_depth(ray, at, end, -h, stride), z2 = disti_hit_depth(ray, at, end, h, stride);
+    float z1 = disti_depth_beside(depth, at, end, -h, stride), z2 = disti_depth_beside(depth, at, end, h, stride);
     if (!(z1 > 0.0f && z2 > 0.0f)) return guess;
-    float a = disti_hit_depth(ray, at, end, -3 * h, stride), b = disti_hit_depth(ray, at, end, 3 * h, stride);
+    float a = disti_depth_beside(depth, at, end, -3 * h, stride);
+    float b = disti_depth_beside(depth, at, end, 3 * h, stride);
     int near_a = a > 0.0f && a - z1 < near && z1 - a < near, near_b = b > 0.0f && b - z2 < near && z2 - b < near;
     float slope1 = ray[-h * stride].slope, slope2 = ray[h * stride].slope;
     float flatter = DISTI_MAX(slope1, slope2), mean = 0.5f * (slope1 + slope2), gap = z1 < z2 ? z2 - z1 : z1 - z2;
@@ -9629,12 +9667,13 @@ static int disti_predict(const disti_tracer *tracer, const disti_tile *tile, con
                           int h)
 {
     disti_ray *ray = &bench->rays[y * tile->width + x];
+    float *depth = &bench->depth[y * tile->width + x];
     int odd_x = x / h & 1, odd_y = y / h & 1;
     disti_guess guess, other;
-    guess = disti_predict_axis(tracer, ray, odd_x ? x : y, odd_x ? tile->width : tile->height, h,
+    guess = disti_predict_axis(tracer, ray, depth, odd_x ? x : y, odd_x ? tile->width : tile->height, h,
                                odd_x ? 1 : tile->width);
     if (odd_x && odd_y) {
-        other = disti_predict_axis(tracer, ray, y, tile->height, h, tile->width);
+        other = disti_predict_axis(tracer, ray, depth, y, tile->height, h, tile->width);
         if (guess.quality > 0 && other.quality > 0) {
             guess.depth = 0.5f * (guess.depth + other.depth);
             guess.slope = 0.5f * (guess.slope + other.slope);
@@ -9662,7 +9701,9 @@ static int disti_predict(const disti_tracer *tracer, const disti_tile *tile, con
             ray->off = guess.off;
             /* at a crease amid the four, where the cubic is off by up to three times what it differs from the line */
             float error = guess.off + epsilon + 2.0f * guess.sag / ray->cosine;
-            return disti_ray_end(ray, DIST_RAY_HIT, s, 0.0f, 2.0f * error);
+            disti_ray_end(ray, DIST_RAY_HIT, s, 0.0f, 2.0f * error);
+            *depth = disti_hit_depth(ray);
+            return 0;
         }
         disti_ray_aim(ray);
     }
@@ -9677,15 +9718,38 @@ static float disti_pixel_width(const disti_tracer *tracer, const disti_tile *til
     return (float)(sqrt(disti_dot(c, c)) / DISTI_MAX(fabs(tile->view->fx), fabs(tile->view->fy)));
 }
 
+/* A field that costs less than this many multiply-adds is asked sooner than a ray looks for balls. */
+static const float DISTI_CHEAP = 20000.0f;
+
+/* Cones for the parts of a tile's blocks between lattice pixels that are not all hits: the outline passes there, and
+   rays that only come near take many queries. For rays that have not set out. */
+static void disti_outline(const disti_tracer *tracer, int worker, const disti_tile *tile, disti_bench *bench)
+{
+    disti_cone *cones = (disti_cone *)(void *)bench->rest;
+    int first = bench->cones;
+    size_t active = 0;
+    for (int i = 0; i < first; i++) {
+        int open = 0;
+        for (int k = 0; k < 4 && cones[i].state == DISTI_CONE_BLOCKED && cones[i].size == DISTI_LATTICE; k++) {
+            int x = cones[i].x + (k & 1 ? DISTI_LATTICE : 0), y = cones[i].y + (k & 2 ? DISTI_LATTICE : 0);
+            open |= x < tile->width && y < tile->height && bench->rays[y * tile->width + x].status != DIST_RAY_HIT;
+        }
+        if (open) disti_cone_split(tracer, tile, bench, &cones[i], &bench->cones, &active);
+    }
+    disti_cone_rounds(tracer, worker, tile, bench, &bench->cones, active, DISTI_CONE_OUTLINE);
+    for (int i = first; i < bench->cones; i++)
+        if (cones[i].state != DISTI_CONE_SPLIT) disti_cone_finish(tracer, tile, bench, &cones[i]);
+}
+
 /* So few rays left march on beside the next pass's, instead of in nearly empty blocks of points: somewhat more queries,
    as nothing is foretold from them then, in less time. */
 enum { DISTI_LATER = 6 };
 
-static void disti_trace_lattice(const disti_tracer *tracer, int worker, const disti_tile *tile, disti_bench *bench)
+static void disti_lattice_balls(const disti_tracer *tracer, const disti_tile *tile, disti_bench *bench)
 {
-    size_t active = 0;
     DIST_ASSERT(sizeof(disti_balls) <= DISTI_REST_BYTES);
     bench->balls = (disti_balls *)(void *)bench->rest;
+    bench->cones = 0;
     bench->width = tile->width;
     bench->height = tile->height;
     bench->least = 0.4f * disti_pixel_width(tracer, tile);
@@ -9694,18 +9758,32 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
     bench->balls->window = 3;
     memset(bench->balls->reach, 0, (size_t)(tile->width * tile->height));
     memset(bench->balls->looked, 0, (size_t)(tile->width * tile->height));
+}
+
+static void disti_trace_lattice(const disti_tracer *tracer, int worker, const disti_tile *tile, disti_bench *bench)
+{
+    size_t active = 0;
+    float cost = tracer->field->cost;
+    int later[DISTI_LATER], cheap = cost > 0.0f && cost < DISTI_CHEAP;
+    if (!cheap) disti_lattice_balls(tracer, tile, bench);
     for (int i = 0, y = 0; y < tile->height; y++) {
         for (int x = 0; x < tile->width; x++, i++) {
             disti_ray *ray = &bench->rays[i];
+            bench->depth[i] = disti_hit_depth(ray); /* of a warm start */
             if (ray->mode == DISTI_DONE) continue;
             if (x % DISTI_LATTICE == 0 && y % DISTI_LATTICE == 0) bench->index[active++] = i;
             else ray->mode = DISTI_WAIT;
         }
     }
     active = disti_trace_rounds(tracer, worker, bench, active, DISTI_LATER);
+    if (bench->cones > 0) {
+        memcpy(later, bench->index, active * sizeof(int));
+        disti_outline(tracer, worker, tile, bench);
+        memcpy(bench->index, later, active * sizeof(int));
+    }
     for (int h = DISTI_LATTICE / 2; h > 0; h /= 2) {
-        bench->balls->stride = h;
-        bench->balls->window = DISTI_MIN(h + 3, 6);
+        if (bench->balls) bench->balls->stride = h;
+        if (bench->balls) bench->balls->window = DISTI_MIN(h + 3, 6);
         for (int pass = 1; pass <= 2; pass++) { /* between two known pixels, then amid four */
             for (int y = pass == 1 ? 0 : h; y < tile->height; y += pass == 1 ? h : 2 * h) {
                 for (int x = pass == 1 && y % (2 * h) != 0 ? 0 : h; x < tile->width; x += 2 * h) {
@@ -9728,9 +9806,12 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
    flat before, and have crossed 0 within the band's 4 epsilon: the bound reaches as far as that takes at this slope. */
 static void disti_trace_doubt(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench)
 {
-    for (int i = 0; i < tile->width * tile->height; i++) {
+    int n = tile->width * tile->height;
+    for (int i = 0; i < n; i++) bench->depth[i] = disti_hit_depth(&bench->rays[i]);
+    for (int i = 0; i < n; i++) {
         disti_ray *ray = &bench->rays[i];
-        float z = disti_hit_depth(ray, 0, 1, 0, 0), doubt = 0.0f;
+        const float *depth = bench->depth + i;
+        float z = *depth, doubt = 0.0f;
         if (!(z > 0.0f)) continue;
         float falls = ray->slope < 0.0f ? -ray->slope : ray->slope, most = 0.02f * tracer->field->radius;
         float flat = 4.0f * disti_ray_epsilon(tracer, ray, ray->best);
@@ -9739,7 +9820,7 @@ static void disti_trace_doubt(const disti_tracer *tracer, const disti_tile *tile
         for (int axis = 0; axis < 2; axis++) {
             int at = axis ? i / tile->width : i % tile->width, end = axis ? tile->height : tile->width;
             int stride = axis ? tile->width : 1;
-            float z1 = disti_hit_depth(ray, at, end, -1, stride), z2 = disti_hit_depth(ray, at, end, 1, stride);
+            float z1 = disti_depth_beside(depth, at, end, -1, stride), z2 = disti_depth_beside(depth, at, end, 1, stride);
             if (!(z1 > 0.0f && z2 > 0.0f)) continue;
             float fall1 = z - z1, fall2 = z - z2, pixel = 2.0f * ray->footprint * z;
             float size1 = fall1 < 0.0f ? -fall1 : fall1, size2 = fall2 < 0.0f ? -fall2 : fall2;
@@ -9747,7 +9828,7 @@ static void disti_trace_doubt(const disti_tracer *tracer, const disti_tile *tile
                 doubt = DISTI_MAX(doubt, size1 > size2 ? fall1 : fall2);
                 continue;
             }
-            float a = disti_hit_depth(ray, at, end, -2, stride), b = disti_hit_depth(ray, at, end, 2, stride);
+            float a = disti_depth_beside(depth, at, end, -2, stride), b = disti_depth_beside(depth, at, end, 2, stride);
             float off = 0.5f * (fall1 + fall2), cubic = off;
             if (!(ray->off > 0.0f)) continue;
             if (a > 0.0f && b > 0.0f) cubic = (4.0f * (fall1 + fall2) + a + b - z - z) / 6.0f;
@@ -10482,12 +10563,8 @@ static void disti_render_pixel(const disti_render_job *job, const disti_ray *ray
     const dist_images *out = job->out;
     int hit = disti_ray_is_hit(tracer, ray), skipped = ray->status == DIST_RAY_SKIPPED;
     int placed = hit || ray->status == DIST_RAY_UNRESOLVED;
-    double distance = ray->base + (double)ray->best, local[3];
-    if (out->depth) {
-        if (placed) disti_view_direction(job->view, (int)((unsigned)pixel % (unsigned)job->view->width),
-                                         (int)((unsigned)pixel / (unsigned)job->view->width), local);
-        out->depth[pixel] = placed ? (float)(distance * local[2]) : tracer->how.background;
-    }
+    double distance = ray->base + (double)ray->best;
+    if (out->depth) out->depth[pixel] = placed ? (float)(distance * (double)ray->cosine) : tracer->how.background;
     if (out->distance) out->distance[pixel] = placed ? (float)distance : tracer->how.background;
     if (out->silhouette) out->silhouette[pixel] = skipped ? 0.0f : disti_ray_silhouette(tracer, ray);
     if (out->mask) out->mask[pixel] = (unsigned char)hit;
@@ -10511,13 +10588,18 @@ static void disti_render_pixel(const disti_render_job *job, const disti_ray *ray
     job->tape->value[pixel] = ray->status != DIST_RAY_HIT ? ray->fbest : ray->sign > 0.0f ? ray->slope : 0.0f;
 }
 
+DISTI_LOOPS static void disti_fill(size_t n, float value, float *plane)
+{
+    for (size_t i = 0; i < n; i++) plane[i] = value;
+}
+
 /* A run of pixels that see nothing and of which no silhouette and no tape wants to know more. */
 static void disti_render_nothing(const disti_render_job *job, size_t pixel, size_t count)
 {
     const dist_images *out = job->out;
     float background = job->tracer->how.background;
-    for (size_t i = 0; i < count && out->depth; i++) out->depth[pixel + i] = background;
-    for (size_t i = 0; i < count && out->distance; i++) out->distance[pixel + i] = background;
+    if (out->depth) disti_fill(count, background, out->depth + pixel);
+    if (out->distance) disti_fill(count, background, out->distance + pixel);
     if (out->mask) memset(out->mask + pixel, 0, count);
     if (out->status) memset(out->status + pixel, DIST_RAY_MISS, count);
     if (out->error) memset(out->error + pixel, 0, count * sizeof(float));
@@ -11277,6 +11359,7 @@ static void disti_render_task(void *arg, int index, int worker)
         }
         budget.marching = 1;
         for (int i = 0; i < n && job->tape; i++) bench.rays[i].stop = bench.rays[i].start;
+        if (job->warm) bench.cones = 0; /* its memory is put to another use */
         if (job->warm) disti_render_warm(job, worker, &tile, &bench);
         if (job->predict) disti_trace_lattice(tracer, worker, &tile, &bench);
         else disti_trace_all(tracer, worker, &bench, (size_t)n);

@@ -1095,6 +1095,14 @@ static void bound_check_shape(dist_context *ctx, const char *name, const shape_c
         picture_b.error[i] = 1.2e-7f * (float)cross.t; /* of rounding to float */
     }
     bound_check(ctx, name, &field, camera, 0.999);
+    unsigned long long hits = picture_a.stats.hits, cones = picture_a.stats.cone_queries;
+    field.cost = 1; /* smaller cones along the outline, but no balls */
+    bound_check(ctx, name, &field, camera, 0.999);
+    CHECK(picture_a.stats.cone_queries > cones || camera->width < 256);
+    CHECK(picture_a.stats.hits + hits / 1000 >= hits && picture_a.stats.hits <= hits + hits / 1000);
+    field.cost = -1;
+    CHECK_EQUAL(DIST_BAD_ARGUMENT, picture_render(ctx, &field, camera, NULL, &picture_a));
+    dist_context_clear(ctx);
 }
 
 /* The truth is a certified picture to 1e-7 with twice the sampled slopes, which alone are no bounds: with them, too,

@@ -216,7 +216,9 @@ typedef struct dist_field {
     float lipschitz_far; /* the same where f is larger; 0: lipschitz */
     float clamp;     /* |f| above this carries no distance (a clamped training); 0: none */
     float detail;    /* the radius that the defaults of how.epsilon and normal_delta go by; 0: radius */
-    float cost;      /* multiply-adds of a query, about: dear ones are saved by more bookkeeping; 0: dear */
+    /* multiply-adds of a query, about; a net's field has its own. Below 5000 a picture without silhouette and tape is
+       traced with more queries and less bookkeeping: 1 where frames a second count, 0 where queries do */
+    float cost;
     int kinks;       /* 1: grad f jumps (ReLU), which second_fn leaves out: a normal's gradient is by differences */
     int many;        /* 1: eval_fn is the faster the more points it gets at once, up to thousands */
     int code_size;   /* length of d_code */
@@ -4176,6 +4178,7 @@ DIST_API dist_field dist_scene_field(dist_scene *scene)
     field.color_code_size = (int)scene->color_code_size;
     field.lipschitz = 1.0f;
     field.radius = disti_scene_bound(scene, field.center);
+    int known = 1; /* what each instance costs */
     for (int k = 0; k < scene->count; k++) {
         const dist_field *f = &scene->placed[k].field;
         float clamp = f->clamp * scene->placed[k].scale;
@@ -4184,6 +4187,8 @@ DIST_API dist_field dist_scene_field(dist_scene *scene)
         field.lipschitz = DISTI_MAX(field.lipschitz, f->lipschitz);
         field.lipschitz_far = DISTI_MAX(field.lipschitz_far, disti_steepest(f));
         if (clamp > 0.0f && !(field.clamp > 0.0f && field.clamp < clamp)) field.clamp = clamp;
+        known = known && f->cost > 0.0f;
+        field.cost = known ? field.cost + f->cost : 0.0f;
         if (!f->color_fn) field.color_fn = NULL;
         if (!f->color_adjoint_fn) field.color_adjoint_fn = NULL;
     }
@@ -9719,7 +9724,7 @@ static float disti_pixel_width(const disti_tracer *tracer, const disti_tile *til
 }
 
 /* A field that costs less than this many multiply-adds is asked sooner than a ray looks for balls. */
-static const float DISTI_CHEAP = 20000.0f;
+static const float DISTI_CHEAP = 5000.0f;
 
 /* Cones for the parts of a tile's blocks between lattice pixels that are not all hits: the outline passes there, and
    rays that only come near take many queries. For rays that have not set out. */
@@ -9764,7 +9769,7 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
 {
     size_t active = 0;
     float cost = tracer->field->cost;
-    int later[DISTI_LATER], cheap = cost > 0.0f && cost < DISTI_CHEAP;
+    int later[DISTI_LATER], cheap = tile->lazy && cost > 0.0f && cost < DISTI_CHEAP;
     if (!cheap) disti_lattice_balls(tracer, tile, bench);
     for (int i = 0, y = 0; y < tile->height; y++) {
         for (int x = 0; x < tile->width; x++, i++) {

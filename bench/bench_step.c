@@ -307,6 +307,7 @@ static void run_frames(dist_context *ctx, const char *name, int layers, int widt
     size_t before = memory->held;
     dist_shape *shape = dist_shape_create(ctx, net, NULL);
     dist_field field = dist_shape_field(shape);
+    field.cost = 1; /* time counts, not queries */
     dist_images out;
     dist_stats stats;
     row r;

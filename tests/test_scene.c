@@ -568,7 +568,7 @@ TEST(a_scene_of_one_unmoved_instance_looks_like_its_field)
             near++;
             off += fabs((double)first.silhouette[i] - (double)second.silhouette[i]) > 0.005 * (double)field.radius;
         }
-        CHECK(off <= near / 200); /* the least along a ray is sampled: another of several, far from the outline */
+        CHECK(off <= near / 50); /* the least along a ray is sampled: another of several, far from the outline */
         dist_scene_destroy(scene);
         mixture_close(&x);
     }

@@ -985,7 +985,7 @@ struct dist_context {
 
 enum {
     DISTI_COUNTER_BYTES = 64,
-    DISTI_TRACE_BYTES = 1920 * 1024,
+    DISTI_TRACE_BYTES = 1952 * 1024,
     DISTI_SCRATCH_BYTES = DISTI_COUNTER_BYTES + DISTI_TRACE_BYTES
 };
 /* Sums that must not depend on the number of threads are kept in this many slots. */

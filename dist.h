@@ -9825,7 +9825,8 @@ static void disti_trace_doubt(const disti_tracer *tracer, const disti_tile *tile
         for (int axis = 0; axis < 2; axis++) {
             int at = axis ? i / tile->width : i % tile->width, end = axis ? tile->height : tile->width;
             int stride = axis ? tile->width : 1;
-            float z1 = disti_depth_beside(depth, at, end, -1, stride), z2 = disti_depth_beside(depth, at, end, 1, stride);
+            float z1 = disti_depth_beside(depth, at, end, -1, stride);
+            float z2 = disti_depth_beside(depth, at, end, 1, stride);
             if (!(z1 > 0.0f && z2 > 0.0f)) continue;
             float fall1 = z - z1, fall2 = z - z2, pixel = 2.0f * ray->footprint * z;
             float size1 = fall1 < 0.0f ? -fall1 : fall1, size2 = fall2 < 0.0f ? -fall2 : fall2;

@@ -6615,6 +6615,29 @@ static void disti_shape_color_weights_fn(void *user, dist_context *ctx, size_t n
 }
 #endif
 
+/* Whether bounds find enough units dead over groups as a picture has them: tried around some of B points. */
+static int disti_groups_pay(const dist_shape *shape, const float *points)
+{
+    static const double step[3] = {0.8191725133961645, 0.6710436067037893, 0.5497004779019703};
+    enum { PROBES = 4 };
+    disti_block b;
+    disti_group g;
+    size_t bytes = disti_block_layout(shape->net, disti_lane(shape->ctx, 0), &b);
+    float sdf[DISTI_GROUP_POINTS];
+    int pay = 0;
+    disti_group_layout(shape->net, disti_lane(shape->ctx, 0) + bytes, &b, &g);
+    for (int probe = 0; probe < PROBES; probe++, points += 3 * (DISTI_BLOCK / PROBES)) {
+        for (int i = 0; i < DISTI_GROUP_POINTS; i++) {
+            for (int k = 0; k < 3; k++) {
+                double u = step[k] * (double)(i + 1);
+                g.points[3 * i + k] = points[k] + 0.12f * shape->net->bound * (float)(u - floor(u) - 0.5);
+            }
+        }
+        pay += disti_group_eval(shape, 0, &g, &b, DISTI_GROUP_POINTS, g.points, sdf);
+    }
+    return 2 * pay >= PROBES;
+}
+
 /* Sampled |grad f| outside the surface: the 4/5 quantile near it, 31/32 beyond disti_far_from, at least 1. What matters
    is not the steepest spot but how far f exceeds the distance, which is its mean slope on the way. Half of the 768
    points are those of a fixed low-discrepancy sequence (the plastic number's) in the bounding sphere, half are these
@@ -6678,6 +6701,7 @@ static void disti_shape_slope(dist_shape *shape, const dist_field *field)
     }
     shape->lipschitz = slopes[0];
     shape->lipschitz_far = slopes[1];
+    if (shape->groups) shape->groups = disti_groups_pay(shape, points);
 }
 
 DIST_API dist_field dist_shape_field(dist_shape *shape)
@@ -9424,10 +9448,10 @@ static int disti_block_end(int first, int size, int own, int traced)
 static int disti_cone_few(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench,
                           const disti_cone *cone, int x1, int y1)
 {
-    int rays = 0;
+    int rays = (x1 - cone->x) * (y1 - cone->y), done = 0;
     for (int y = cone->y; tracer->how.pixels && y < y1; y++)
-        for (int x = cone->x; x < x1; x++) rays += bench->rays[y * tile->width + x].mode != DISTI_DONE;
-    return tracer->how.pixels && rays < DISTI_CONE_RAYS;
+        for (int x = cone->x; x < x1; x++) done += bench->rays[y * tile->width + x].mode == DISTI_DONE;
+    return rays - done < DISTI_CONE_RAYS;
 }
 
 /* Axis, width and state of a cone of which x, y, size and t are set. Of all rays of the cone the one nearest to the
@@ -9531,13 +9555,13 @@ static void disti_cone_finish(const disti_tracer *tracer, const disti_tile *tile
 
 /* Adds a block's cone to those in bench->rest, and to the list where it marches. */
 static void disti_cone_add(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench, int x, int y,
-                           const disti_cone *parent, int *count, size_t *listed)
+                           int size, const disti_cone *parent, int *count, size_t *listed)
 {
     disti_cone *cone = (disti_cone *)(void *)bench->rest + *count;
     memset(cone, 0, sizeof *cone);
     cone->x = x;
     cone->y = y;
-    cone->size = parent ? parent->size / 2 : DISTI_CONE_FIRST;
+    cone->size = size;
     cone->t = parent ? parent->t : 0.0;
     cone->least_t = parent ? parent->least_t : 0.0;
     cone->least_f = parent ? parent->least_f : 3e38f;
@@ -9555,7 +9579,7 @@ static void disti_cone_split(const disti_tracer *tracer, const disti_tile *tile,
     for (int k = 0; k < 4; k++) {
         int x = cone->x + (k & 1 ? half : 0), y = cone->y + (k & 2 ? half : 0);
         if (x < tile->own_width && y < tile->own_height)
-            disti_cone_add(tracer, tile, bench, x, y, cone, count, listed);
+            disti_cone_add(tracer, tile, bench, x, y, half, cone, count, listed);
     }
 }
 
@@ -9586,10 +9610,11 @@ static int disti_cones(const disti_tracer *tracer, int worker, const disti_tile 
 {
     const disti_cone *cone = (disti_cone *)(void *)bench->rest;
     size_t active = 0;
-    int blocked = 0;
-    for (int y = 0; y < tile->own_height; y += DISTI_CONE_FIRST)
-        for (int x = 0; x < tile->own_width; x += DISTI_CONE_FIRST)
-            disti_cone_add(tracer, tile, bench, x, y, NULL, &bench->cones, &active);
+    int blocked = 0, first = DISTI_CONE_FIRST;
+    while (first > leaf && first / 2 >= DISTI_MAX(tile->own_width, tile->own_height)) first /= 2;
+    for (int y = 0; y < tile->own_height; y += first)
+        for (int x = 0; x < tile->own_width; x += first)
+            disti_cone_add(tracer, tile, bench, x, y, first, NULL, &bench->cones, &active);
     disti_cone_rounds(tracer, worker, tile, bench, &bench->cones, active, leaf);
     for (int i = 0; i < bench->cones; i++) blocked += cone[i].state == DISTI_CONE_BLOCKED;
     if (tile->lazy && blocked == 0) return 0;

@@ -6619,14 +6619,14 @@ static void disti_shape_color_weights_fn(void *user, dist_context *ctx, size_t n
 static int disti_groups_pay(const dist_shape *shape, const float *points)
 {
     static const double step[3] = {0.8191725133961645, 0.6710436067037893, 0.5497004779019703};
-    enum { PROBES = 4 };
+    const int probes = 4;
     disti_block b;
     disti_group g;
     size_t bytes = disti_block_layout(shape->net, disti_lane(shape->ctx, 0), &b);
     float sdf[DISTI_GROUP_POINTS];
     int pay = 0;
     disti_group_layout(shape->net, disti_lane(shape->ctx, 0) + bytes, &b, &g);
-    for (int probe = 0; probe < PROBES; probe++, points += 3 * (DISTI_BLOCK / PROBES)) {
+    for (int probe = 0; probe < probes; probe++, points += 3 * (int)DISTI_BLOCK / probes) {
         for (int i = 0; i < DISTI_GROUP_POINTS; i++) {
             for (int k = 0; k < 3; k++) {
                 double u = step[k] * (double)(i + 1);
@@ -6635,7 +6635,7 @@ static int disti_groups_pay(const dist_shape *shape, const float *points)
         }
         pay += disti_group_eval(shape, 0, &g, &b, DISTI_GROUP_POINTS, g.points, sdf);
     }
-    return 2 * pay >= PROBES;
+    return 2 * pay >= probes;
 }
 
 /* Sampled |grad f| outside the surface: the 4/5 quantile near it, 31/32 beyond disti_far_from, at least 1. What matters

@@ -568,7 +568,8 @@ TEST(a_scene_of_one_unmoved_instance_looks_like_its_field)
             near++;
             off += fabs((double)first.silhouette[i] - (double)second.silhouette[i]) > 0.005 * (double)field.radius;
         }
-        CHECK(off <= near / 50); /* the least along a ray is sampled: another of several, far from the outline */
+        /* the least along a ray is sampled: another of several, far from the outline, most where a net is steep */
+        CHECK(off <= near / (which < 3 ? 200 : 50));
         dist_scene_destroy(scene);
         mixture_close(&x);
     }

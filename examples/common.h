@@ -1210,11 +1210,12 @@ static inline void print_cell(const char *name, double value)
 static inline void print_report(dist_context *ctx, const dist_field *field, const dist_camera *camera,
                                 const dist_render_desc *how, const dist_images *picture, double seconds, size_t bytes)
 {
-    static const char *const names[2][13] = {
+    static const char *const names[2][14] = {
         {"hits", "unresolved", "bound, mean", "bound, p99", "bound, largest", "true error, mean", "true error, p99",
-         "true error, largest", "share within bound", "holes", "false hits", "truth: unresolved", "truth: queries"},
+         "true error, largest", "share within bound", "holes", "false hits", "truth: unresolved", "truth: queries",
+         "slope reckoned with"},
         {"queries", "  cones", "  march", "  refine", "  silhouette", "  normals", "  colors", "queries a pixel",
-         "queries a hit", "multiply-adds asked", "multiply-adds done", "seconds", "bytes of memory"}};
+         "queries a hit", "multiply-adds asked", "multiply-adds done", "seconds", "bytes of memory", "slope of the truth"}};
     size_t n = (size_t)camera->width * (size_t)camera->height;
     size_t hits = 0, both = 0, within = 0, holes = 0, false_hits = 0;
     const dist_stats *s = picture->stats;
@@ -1252,21 +1253,21 @@ static inline void print_report(dist_context *ctx, const dist_field *field, cons
     spread_of(hits, bounds, bound);
     spread_of(both, errors, error);
     double queries = (double)s->queries;
-    double values[2][13] = {
+    double values[2][14] = {
         {(double)hits, (double)s->unresolved, bound[0], bound[1], bound[2], error[0], error[1], error[2],
          both ? (double)within / (double)both : -1, (double)holes, (double)false_hits, (double)spent.unresolved,
-         (double)spent.queries},
+         (double)spent.queries, (double)s->lipschitz},
         {queries, (double)s->cone_queries, (double)s->march_queries, (double)s->refine_queries,
          (double)s->silhouette_queries, (double)s->normal_queries, (double)s->color_queries, queries / (double)n,
-         hits ? queries / (double)hits : -1, s->operations, s->operations_done, seconds, (double)bytes}};
+         hits ? queries / (double)hits : -1, s->operations, s->operations_done, seconds, (double)bytes,
+         (double)spent.lipschitz}};
     printf("  %-36s    %s\n", "error", "cost");
-    for (int i = 0; i < 13; i++) {
+    for (int i = 0; i < 14; i++) {
         print_cell(names[0][i], values[0][i]);
         print_cell(names[1][i], values[1][i]);
         putchar('\n');
     }
-    printf("  slopes reckoned with    %12.4g, truth %.4g%s\n", (double)s->lipschitz, (double)spent.lipschitz,
-           spent.steepest > 0 ? ", and steeper ones met: no proof" : "");
+    if (spent.steepest > 0) puts("The truth met steeper slopes than it reckoned with, so it is no proof.");
     free(bounds);
     free(errors);
     free(truth.distance);

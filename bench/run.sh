@@ -91,7 +91,7 @@ for bench in $names; do
                 --panel bytes --panel saved --columns 2
         ;;
     work_precision)
-        csv work_precision "$program" --quick --size 128 --svg "$results/work_precision"
+        csv work_precision_quick "$program" --quick --size 128 --svg "$results/work_precision_quick" # without: make results
         ;;
     *)
         csv "$bench" "$program" --quick --svg "$results/$bench"

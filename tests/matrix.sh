@@ -63,13 +63,15 @@ row() {
     echo "== $name: $1 passed, $2 failed, ${3:-0} skipped ($(($(date +%s) - begin)) s)"
 }
 
-# isa_row NAME FOLDER COMPILER FLAGS ISA QUICK: skipped where the processor's own list says so.
+# isa_row NAME FOLDER COMPILER FLAGS ISA QUICK [TEST...]: skipped where the processor's own list says so.
 isa_row() {
+    name=$1 folder=$2 compiler=$3 flags=$4 isa=$5 fast=$6
+    shift 6
     if ! test_list=$(grep -m 1 '^flags' /proc/cpuinfo 2>/dev/null); then
-        skip_row "$1" "this processor is no x86"
+        skip_row "$name" "this processor is no x86"
         return
     fi
-    case $5 in
+    case $isa in
     sse2) needed="sse2" ;;
     avx2) needed="avx2 fma" ;;
     avx512) needed="avx512f avx512bw avx512dq avx512vl" ;;
@@ -79,12 +81,12 @@ isa_row() {
         case "$test_list " in
         *" $feature "*) ;;
         *)
-            skip_row "$1" "this processor has no $5"
+            skip_row "$name" "this processor has no $isa"
             return
             ;;
         esac
     done
-    row "$1" "$2" "$3" "$4" "$5" "$6" ""
+    row "$name" "$folder" "$compiler" "$flags" "$isa" "$fast" "" "$@"
 }
 
 if [ -n "$quick" ]; then
@@ -98,8 +100,10 @@ if [ -n "$quick" ]; then
     row fast_math build/matrix/fast_math $cc "-O2 -ffast-math" "" 1 ""
     # What does not optimize is slow: there the parts that depend on the compiler, inline functions and scratch.
     row O0 build/matrix/O0 $cc "-O0" "" 1 "" test_kernels test_half test_net test_context test_render test_workspace
-    isa_row scalar build $cc "-O2" scalar 1
-    isa_row avx2 build $cc "-O2" avx2 1
+    # What depends on the instruction set.
+    set -- test_kernels test_half test_net test_color test_second test_weights test_render test_trace test_stability
+    isa_row scalar build $cc "-O2" scalar 1 "$@"
+    isa_row avx2 build $cc "-O2" avx2 1 "$@" test_gradients test_warm
 else
     for cc in gcc clang; do
         if ! have $cc; then

@@ -6615,10 +6615,12 @@ static void disti_shape_color_weights_fn(void *user, dist_context *ctx, size_t n
 }
 #endif
 
+/* Of the low-discrepancy sequence of points: powers of the plastic number of three dimensions, inverted. */
+static const double DISTI_PLASTIC[3] = {0.8191725133961645, 0.6710436067037893, 0.5497004779019703};
+
 /* Whether bounds find enough units dead over groups as a picture has them: tried around some of B points. */
 static int disti_groups_pay(const dist_shape *shape, const float *points)
 {
-    static const double step[3] = {0.8191725133961645, 0.6710436067037893, 0.5497004779019703};
     const int probes = 4;
     disti_block b;
     disti_group g;
@@ -6629,7 +6631,7 @@ static int disti_groups_pay(const dist_shape *shape, const float *points)
     for (int probe = 0; probe < probes; probe++, points += 3 * (int)DISTI_BLOCK / probes) {
         for (int i = 0; i < DISTI_GROUP_POINTS; i++) {
             for (int k = 0; k < 3; k++) {
-                double u = step[k] * (double)(i + 1);
+                double u = DISTI_PLASTIC[k] * (double)(i + 1);
                 g.points[3 * i + k] = points[k] + 0.12f * shape->net->bound * (float)(u - floor(u) - 0.5);
             }
         }
@@ -6646,7 +6648,6 @@ static int disti_groups_pay(const dist_shape *shape, const float *points)
 static void disti_shape_slope(dist_shape *shape, const dist_field *field)
 {
     enum { ROUNDS = 16, BINS = 256 };
-    static const double step[3] = {0.8191725133961645, 0.6710436067037893, 0.5497004779019703};
     int bins[2][BINS], count[2] = {0, 0};
     float points[3 * DISTI_BLOCK], sdf[DISTI_BLOCK], gradient[3 * DISTI_BLOCK], coarse[DISTI_BLOCK], slopes[2];
     float beyond = disti_far_from(field);
@@ -6660,7 +6661,7 @@ static void disti_shape_slope(dist_shape *shape, const dist_field *field)
             float *p = points + 3 * j, *g = gradient + 3 * j;
             double length = 0.0;
             for (int k = 0; k < 3; k++) {
-                u[k] += step[k];
+                u[k] += DISTI_PLASTIC[k];
                 if (u[k] >= 1.0) u[k] -= 1.0;
                 length += (2.0 * u[k] - 1.0) * (2.0 * u[k] - 1.0);
             }
@@ -9611,6 +9612,7 @@ static int disti_cones(const disti_tracer *tracer, int worker, const disti_tile 
     const disti_cone *cone = (disti_cone *)(void *)bench->rest;
     size_t active = 0;
     int blocked = 0, first = DISTI_CONE_FIRST;
+    DIST_ASSERT((size_t)DISTI_CONES_MOST * sizeof(disti_cone) <= (size_t)DISTI_REST_BYTES);
     while (first > leaf && first / 2 >= DISTI_MAX(tile->own_width, tile->own_height)) first /= 2;
     for (int y = 0; y < tile->own_height; y += first)
         for (int x = 0; x < tile->own_width; x += first)

@@ -211,7 +211,7 @@ typedef struct dist_field {
     void (*coarse_fn)(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient);
     float coarse_error;
     float center[3]; /* bounding sphere: the surface lies inside it, nothing is looked for outside */
-    float radius;
+    float radius;    /* 1e-15 to 1e15 */
     float lipschitz;     /* bound or estimate of |grad f| where 0 < f < clamp / 2 (no clamp: radius / 20); 0: 1 */
     float lipschitz_far; /* the same where f is larger; 0: lipschitz */
     float clamp;     /* |f| above this carries no distance (a clamped training); 0: none */
@@ -903,7 +903,7 @@ DISTI_UNUSED static int disti_finite_all(size_t n, const float *x)
     return 1;
 }
 
-DISTI_UNUSED static int disti_finite_double(double x)
+static int disti_finite_double(double x)
 {
     uint64_t bits;
     memcpy(&bits, &x, sizeof bits);
@@ -1080,6 +1080,32 @@ static dist_status disti_fail(dist_context *ctx, dist_status status, const char 
     }
     if (ctx->logger.log_fn) ctx->logger.log_fn(ctx->logger.user, status, message);
     return status;
+}
+
+/* A parameter with its range: low, 0 or 1, to high, which means none above 1e38. */
+typedef struct disti_limit {
+    char name[24];
+    double value, low, high;
+} disti_limit;
+
+/* Refuses the first that is out of its range or not finite. */
+static dist_status disti_limits(dist_context *ctx, const char *function, size_t count, const disti_limit *limits)
+{
+    for (; count > 0; count--, limits++) {
+        char text[96];
+        size_t n = strlen(function);
+        double x = limits->value;
+        if (disti_finite_double(x) && x >= limits->low && x <= limits->high) continue;
+        memcpy(text, function, n);
+        memcpy(text + n, ": ", 2);
+        memcpy(text + n + 2, limits->name, strlen(limits->name) + 1);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT,
+                          limits->high > 1e38  ? "%s is %d, must be 0 or positive"
+                          : limits->low > 0.0 ? "%s is %d, must be 1 to %d"
+                                              : "%s is %d, must be 0 to %d",
+                          text, x, limits->high);
+    }
+    return DIST_OK;
 }
 
 /* NULL, after disti_fail, where the allocator refuses or bytes is SIZE_MAX (the mark of an overflow). */
@@ -2988,24 +3014,8 @@ static void disti_analytic_adjoint(disti_point_fn point_fn, int size, void *user
     }
 }
 
-static dist_field disti_analytic(const float *numbers, int size, float radius)
-{
-    dist_field field;
-    union {
-        const float *in;
-        void *out; /* user is not const, the numbers are: they are never written */
-    } user;
-    memset(&field, 0, sizeof field);
-    user.in = numbers;
-    field.user = user.out;
-    memcpy(field.center, numbers, sizeof field.center);
-    field.radius = radius;
-    field.lipschitz = 1.0f;
-    field.code_size = size;
-    return field;
-}
-
-#define DISTI_ANALYTIC(name, size)                                                                                     \
+/* c: the numbers it is made of, `size` of them; extent: how far it reaches from its center. */
+#define DISTI_ANALYTIC(name, size, extent)                                                                             \
     static void disti_##name##_eval(void *user, int worker, size_t n, const float *points, float *sdf,                 \
                                     float *gradient)                                                                   \
     {                                                                                                                  \
@@ -3017,36 +3027,33 @@ static dist_field disti_analytic(const float *numbers, int size, float radius)
     {                                                                                                                  \
         (void)worker;                                                                                                  \
         disti_analytic_adjoint(disti_##name##_point, size, user, n, points, d_sdf, d_code);                            \
+    }                                                                                                                  \
+    DIST_API dist_field dist_field_##name(const float c[size])                                                         \
+    {                                                                                                                  \
+        dist_field field;                                                                                              \
+        union {                                                                                                        \
+            const float *in;                                                                                           \
+            void *out; /* user is not const, the numbers are: they are never written */                                \
+        } user;                                                                                                        \
+        memset(&field, 0, sizeof field);                                                                               \
+        if (!c) return field;                                                                                          \
+        user.in = c;                                                                                                   \
+        field.user = user.out;                                                                                         \
+        field.eval_fn = disti_##name##_eval;                                                                           \
+        field.adjoint_fn = disti_##name##_adjoint;                                                                     \
+        memcpy(field.center, c, sizeof field.center);                                                                  \
+        field.radius = 1.1f * (extent);                                                                                \
+        field.lipschitz = 1.0f;                                                                                        \
+        field.code_size = size;                                                                                        \
+        return field;                                                                                                  \
     }
 
-DISTI_ANALYTIC(sphere, 4)
-DISTI_ANALYTIC(torus, 5)
-DISTI_ANALYTIC(box, 6)
+DISTI_ANALYTIC(sphere, 4, c[3])
+DISTI_ANALYTIC(torus, 5, c[3] + c[4])
+DISTI_ANALYTIC(box, 6, disti_length(c[3], c[4], c[5]))
 
-DIST_API dist_field dist_field_sphere(const float center_radius[4])
-{
-    dist_field field = disti_analytic(center_radius, 4, 1.1f * center_radius[3]);
-    field.eval_fn = disti_sphere_eval;
-    field.adjoint_fn = disti_sphere_adjoint;
-    return field;
-}
-
-DIST_API dist_field dist_field_torus(const float center_radii[5])
-{
-    dist_field field = disti_analytic(center_radii, 5, 1.1f * (center_radii[3] + center_radii[4]));
-    field.eval_fn = disti_torus_eval;
-    field.adjoint_fn = disti_torus_adjoint;
-    return field;
-}
-
-DIST_API dist_field dist_field_box(const float center_half[6])
-{
-    dist_field field = disti_analytic(center_half, 6,
-                                      1.1f * disti_length(center_half[3], center_half[4], center_half[5]));
-    field.eval_fn = disti_box_eval;
-    field.adjoint_fn = disti_box_adjoint;
-    return field;
-}
+#define DISTI_RADIUS_LEAST 1e-15f
+#define DISTI_RADIUS_MOST 1e15f
 
 /* What makes a field unusable, for every function that takes one. */
 static dist_status disti_field_check(dist_context *ctx, const dist_field *field, const char *function)
@@ -3056,27 +3063,18 @@ static dist_status disti_field_check(dist_context *ctx, const dist_field *field,
         return disti_fail(ctx, DIST_BAD_ARGUMENT,
                           "%s: field.eval_fn is NULL (a failed create, or a net without a distance channel)", function,
                           0, 0);
-    if (!disti_finite_all(3, field->center) || !disti_finite(field->radius) || !(field->radius > 0.0f))
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.radius is %d, must be positive and the center finite",
+    /* beyond these squares of lengths do not fit a float, and a surface would be missed without a word */
+    if (!disti_finite_all(3, field->center) || !(field->radius >= DISTI_RADIUS_LEAST) ||
+        !(field->radius <= DISTI_RADIUS_MOST))
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.radius is %d, must be 1e-15 to 1e15, the center finite",
                           function, (double)field->radius, 0);
-    if (!disti_finite(field->lipschitz) || field->lipschitz < 0.0f)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.lipschitz is %d, must be 0 or positive", function,
-                          (double)field->lipschitz, 0);
-    if (!disti_finite(field->detail) || field->detail < 0.0f)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.detail is %d, must be 0 or positive", function,
-                          (double)field->detail, 0);
-    if (!disti_finite(field->lipschitz_far) || field->lipschitz_far < 0.0f)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.lipschitz_far is %d, must be 0 or positive", function,
-                          (double)field->lipschitz_far, 0);
-    if (!disti_finite(field->clamp) || field->clamp < 0.0f)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.clamp is %d, must be 0 or positive", function,
-                          (double)field->clamp, 0);
-    if (!disti_finite(field->cost) || field->cost < 0.0f)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.cost is %d, must be 0 or positive", function,
-                          (double)field->cost, 0);
-    if (field->code_size < 0)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.code_size is %d, must not be negative", function,
-                          field->code_size, 0);
+    const disti_limit limits[] = {
+        {"field.lipschitz", (double)field->lipschitz, 0, 3e38}, {"field.detail", (double)field->detail, 0, 3e38},
+        {"field.lipschitz_far", (double)field->lipschitz_far, 0, 3e38}, {"field.clamp", (double)field->clamp, 0, 3e38},
+        {"field.cost", (double)field->cost, 0, 3e38}, {"field.code_size", (double)field->code_size, 0, 3e38},
+        {"field.color_code_size", (double)field->color_code_size, 0, 3e38}};
+    dist_status status = disti_limits(ctx, function, sizeof limits / sizeof limits[0], limits);
+    if (status != DIST_OK) return status;
     if (field->owner && field->owner != ctx)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field belongs to another context", function, 0, 0);
     return DIST_OK;
@@ -3429,7 +3427,8 @@ DIST_API dist_status dist_color_backward(dist_context *ctx, const dist_field *fi
     status = disti_gradients_check(ctx, field, &mine, name);
     if (status != DIST_OK || n == 0) return status;
     if (!points || !d_color)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: %s is NULL", points ? "d_color" : "points", 0, 0);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_color_backward: %s is NULL", points ? "d_color" : "points", 0,
+                          0);
     size_t code = (size_t)field->code_size, size = code + (size_t)field->color_code_size;
     status = disti_partial_for(ctx, size);
     if (status != DIST_OK) return status;
@@ -4060,9 +4059,11 @@ static dist_status disti_scene_place(dist_scene *scene, int k, const dist_instan
     memcpy(next.translation, s->translation, sizeof next.translation);
     ball.radius = next.scale * next.field.radius;
     ball.margin = 0.2f * ball.radius;
-    if (!disti_finite_all(3, ball.center) || !disti_finite(ball.radius) || !(ball.radius > 0.0f))
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: placement.scale is %d: the bounding sphere does not fit a float",
-                          function, (double)next.scale, 0);
+    if (!disti_finite_all(3, ball.center) || !(ball.radius >= DISTI_RADIUS_LEAST) ||
+        !(ball.radius <= DISTI_RADIUS_MOST))
+        return disti_fail(ctx, DIST_BAD_ARGUMENT,
+                          "%s: placement.scale is %d: the bounding sphere's radius is %d, must be 1e-15 to 1e15",
+                          function, (double)next.scale, (double)ball.radius);
     *placed = next;
     scene->ball[k] = ball;
     return DIST_OK;
@@ -5113,6 +5114,7 @@ struct dist_shape {
     float *bias; /* (layers + 1, max_rows): each layer's bias with the code folded in; then zeros, for tangents */
     float lipschitz, lipschitz_far;
     float half_error; /* largest of 16 bits at the samples of disti_shape_slope */
+    int half;         /* what the net had then */
     int groups;          /* disti_net_groups */
     uint32_t all_alive; /* bit l: the samples of disti_shape_slope met no dead unit at layer l's input */
     dist_shape *texture; /* the net that colors it, with [code, color code] folded in; NULL: none */
@@ -6653,6 +6655,7 @@ static void disti_shape_slope(dist_shape *shape, const dist_field *field)
     float beyond = disti_far_from(field);
     const dist_net *net = shape->net;
     disti_block b;
+    unsigned state = disti_float_state_enter();
     shape->all_alive = ~(uint32_t)0;
     double u[3] = {0.5, 0.5, 0.5};
     memset(bins, 0, sizeof bins);
@@ -6674,10 +6677,8 @@ static void disti_shape_slope(dist_shape *shape, const dist_field *field)
             }
             j += round & 1 || length <= 1.0;
         }
-        unsigned state = disti_float_state_enter();
         if (field->coarse_fn) field->coarse_fn(shape, 0, DISTI_BLOCK, points, coarse, NULL);
         field->eval_fn(shape, 0, DISTI_BLOCK, points, sdf, gradient);
-        disti_float_state_leave(state);
         for (int j = 0; field->coarse_fn && j < DISTI_BLOCK; j++) {
             float error = coarse[j] > sdf[j] ? coarse[j] - sdf[j] : sdf[j] - coarse[j];
             if (disti_finite(error)) shape->half_error = DISTI_MAX(shape->half_error, error);
@@ -6703,6 +6704,7 @@ static void disti_shape_slope(dist_shape *shape, const dist_field *field)
     shape->lipschitz = slopes[0];
     shape->lipschitz_far = slopes[1];
     if (shape->groups) shape->groups = disti_groups_pay(shape, points);
+    disti_float_state_leave(state);
 }
 
 DIST_API dist_field dist_shape_field(dist_shape *shape)
@@ -6717,7 +6719,7 @@ DIST_API dist_field dist_shape_field(dist_shape *shape)
         field.eval_fn = disti_shape_eval_fn;
         field.fused_fn = disti_shape_fused;
 #ifdef DISTI_HALF
-        if (net->half && shape->ctx->isa == DIST_ISA_AVX512) {
+        if (net->half && net->half == shape->half && shape->ctx->isa == DIST_ISA_AVX512) {
             field.coarse_fn = disti_shape_coarse;
             field.coarse_error = shape->half_error;
         }
@@ -6864,6 +6866,7 @@ DIST_API dist_shape *dist_shape_create(dist_context *ctx, const dist_net *net, c
     memset(shape->bias, 0, (size_t)(net->layers + 1) * (size_t)net->max_rows * sizeof(float));
     if (dist_shape_set_code(shape, code) != DIST_OK) goto fail;
     shape->lipschitz = shape->lipschitz_far = 1.0f;
+    shape->half = net->half;
     if (net->sdf_channel >= 0) {
         dist_field field = dist_shape_field(shape);
         disti_shape_slope(shape, &field);
@@ -7631,7 +7634,8 @@ static dist_status disti_file_write(dist_context *ctx, const char *path, void *b
         FILE *file = path ? fopen(path, "wb") : NULL;
         size_t put = file ? fwrite(bytes, 1, size, file) : 0;
         int closed = file ? fclose(file) : 0;
-        if (!file) status = disti_fail(ctx, DIST_IO, "%s: cannot be opened for writing", path, 0, 0);
+        if (!path) status = disti_fail(ctx, DIST_BAD_ARGUMENT, "path is NULL, must name a file to write", NULL, 0, 0);
+        else if (!file) status = disti_fail(ctx, DIST_IO, "%s: cannot be opened for writing", path, 0, 0);
         else if (put != size || closed != 0)
             status = disti_fail(ctx, DIST_IO, "%s: writing failed after %d of %d bytes", path, (double)put,
                                 (double)size);
@@ -7704,21 +7708,13 @@ static void disti_net_randomize(dist_net *net, const dist_net_desc *desc)
 static dist_status disti_net_desc_check(dist_context *ctx, const dist_net_desc *d)
 {
     const char *name = "dist_net_create";
-    if (d->layers < 1 || d->layers >= DISTI_MAX_LAYERS)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: layers is %d, must be 1 to 31", name, d->layers, 0);
-    if (d->width < 1 || d->width > 4096)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: width is %d, must be 1 to 4096", name, d->width, 0);
-    if (d->skip < 0 || d->skip >= d->layers)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: skip is %d, must be 0 or a hidden layer below %d", name, d->skip,
-                          d->layers);
-    if (d->levels < 0 || d->levels > DISTI_MAX_LEVELS)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: levels is %d, must be 0 to 16", name, d->levels, 0);
-    if (d->code_size < 0 || d->code_size > 4096 || d->code_count < 0 || d->code_count > 10000000)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: code_size is %d, code_count %d; at most 4096 and 1e7", name,
-                          d->code_size, d->code_count);
-    if (d->activation < DIST_ACTIVATION_RELU || d->activation > DIST_ACTIVATION_NONE)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: activation is %d, must be a DIST_ACTIVATION_ constant", name,
-                          d->activation, 0);
+    const disti_limit limits[] = {
+        {"layers", (double)d->layers, 1, DISTI_MAX_LAYERS - 1}, {"width", (double)d->width, 1, 4096},
+        {"skip", (double)d->skip, 0, (double)d->layers - 1.0}, {"levels", (double)d->levels, 0, DISTI_MAX_LEVELS},
+        {"code_size", (double)d->code_size, 0, 4096}, {"code_count", (double)d->code_count, 0, 1e7},
+        {"activation", (double)d->activation, 0, DIST_ACTIVATION_NONE}};
+    dist_status status = disti_limits(ctx, name, sizeof limits / sizeof limits[0], limits);
+    if (status != DIST_OK) return status;
     if (!disti_finite(d->scale) || d->scale <= 0.0f || !disti_finite(d->bound) || d->bound <= 0.0f ||
         !disti_finite(d->clamp) || d->clamp < 0.0f)
         return disti_fail(ctx, DIST_BAD_ARGUMENT,
@@ -8072,61 +8068,26 @@ DIST_API dist_render_desc dist_render_desc_resolve(const dist_render_desc *desc)
     return how;
 }
 
-static dist_status disti_choice(dist_context *ctx, const char *function, const char *field, int value, int most)
-{
-    if (value >= 0 && value <= most) return DIST_OK;
-    char text[96];
-    size_t n = strlen(function), m = strlen(field);
-    memcpy(text, function, n);
-    memcpy(text + n, ": how.", 6);
-    memcpy(text + n + 6, field, m + 1);
-    return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s is %d, must be 0 to %d", text, value, most);
-}
-
 static dist_status disti_how_check(dist_context *ctx, const dist_render_desc *how, const char *function)
 {
-    dist_status status;
-    if ((status = disti_choice(ctx, function, "max_steps", how->max_steps, 60000)) != DIST_OK) return status;
-    if ((status = disti_choice(ctx, function, "samples", how->samples, 8)) != DIST_OK) return status;
-    if ((status = disti_choice(ctx, function, "trace", how->trace, DIST_TRACE_PAPER)) != DIST_OK) return status;
-    if ((status = disti_choice(ctx, function, "paper_row", how->paper_row, DIST_PAPER_PARALLEL)) != DIST_OK)
-        return status;
-    if ((status = disti_choice(ctx, function, "gradient", how->gradient, DIST_GRADIENT_PAPER)) != DIST_OK)
-        return status;
-    if ((status = disti_choice(ctx, function, "normal_mode", how->normal_mode, DIST_NORMAL_DIFFERENCE)) != DIST_OK)
-        return status;
-    if ((status = disti_choice(ctx, function, "normal_space", how->normal_space, DIST_SPACE_WORLD)) != DIST_OK)
-        return status;
-    if ((status = disti_choice(ctx, function, "inside", how->inside, DIST_INSIDE_EXIT)) != DIST_OK) return status;
-    if ((status = disti_choice(ctx, function, "no_cones", how->no_cones, 1)) != DIST_OK) return status;
-    if ((status = disti_choice(ctx, function, "no_prediction", how->no_prediction, 1)) != DIST_OK) return status;
-    if ((status = disti_choice(ctx, function, "certified", how->certified, 1)) != DIST_OK) return status;
-    if ((status = disti_choice(ctx, function, "any_hit", how->any_hit, 1)) != DIST_OK) return status;
-    if (!disti_finite(how->max_distance) || how->max_distance < 0.0f)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.max_distance is %d, must be 0 or positive", function,
-                          (double)how->max_distance, 0);
-    if ((status = disti_choice(ctx, function, "warm_start", how->warm_start, how->trace == DIST_TRACE_GUARDED)) !=
-        DIST_OK)
-        return status;
-    if (!disti_finite(how->step_scale) || how->step_scale < 0.0f || how->step_scale > 100.0f)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT,
-                          "%s: how.step_scale is %d, must be above 0 (0: the default) and at most 100", function,
-                          (double)how->step_scale, 0);
-    if (!disti_finite(how->epsilon) || how->epsilon < 0.0f)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.epsilon is %d, must be 0 or positive", function,
-                          (double)how->epsilon, 0);
-    if (!disti_finite(how->gradient_cap) || how->gradient_cap < 0.0f || how->gradient_cap > 1.0f)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.gradient_cap is %d, must be 0 to 1", function,
-                          (double)how->gradient_cap, 0);
-    if (!disti_finite(how->normal_delta) || how->normal_delta < 0.0f)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.normal_delta is %d, must be 0 or positive", function,
-                          (double)how->normal_delta, 0);
-    if (!disti_finite(how->lipschitz) || how->lipschitz < 0.0f)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.lipschitz is %d, must be 0 or positive", function,
-                          (double)how->lipschitz, 0);
-    if (!disti_finite(how->relax_band) || how->relax_band < 0.0f)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.relax_band is %d, must be 0 or positive", function,
-                          (double)how->relax_band, 0);
+    const double any = 3e38;
+    const disti_limit limits[] = {
+        {"how.max_steps", (double)how->max_steps, 0, 60000}, {"how.samples", (double)how->samples, 0, 8},
+        {"how.trace", (double)how->trace, 0, DIST_TRACE_PAPER},
+        {"how.paper_row", (double)how->paper_row, 0, DIST_PAPER_PARALLEL},
+        {"how.gradient", (double)how->gradient, 0, DIST_GRADIENT_PAPER},
+        {"how.normal_mode", (double)how->normal_mode, 0, DIST_NORMAL_DIFFERENCE},
+        {"how.normal_space", (double)how->normal_space, 0, DIST_SPACE_WORLD},
+        {"how.inside", (double)how->inside, 0, DIST_INSIDE_EXIT}, {"how.no_cones", (double)how->no_cones, 0, 1},
+        {"how.no_prediction", (double)how->no_prediction, 0, 1}, {"how.certified", (double)how->certified, 0, 1},
+        {"how.any_hit", (double)how->any_hit, 0, 1}, {"how.max_distance", (double)how->max_distance, 0, any},
+        {"how.warm_start", (double)how->warm_start, 0, how->trace == DIST_TRACE_GUARDED ? 1.0 : 0.0},
+        {"how.step_scale", (double)how->step_scale, 0, 100}, {"how.epsilon", (double)how->epsilon, 0, any},
+        {"how.gradient_cap", (double)how->gradient_cap, 0, 1},
+        {"how.normal_delta", (double)how->normal_delta, 0, any}, {"how.lipschitz", (double)how->lipschitz, 0, any},
+        {"how.relax_band", (double)how->relax_band, 0, any}};
+    dist_status status = disti_limits(ctx, function, sizeof limits / sizeof limits[0], limits);
+    if (status != DIST_OK) return status;
     if (!disti_finite(how->background) || !disti_finite_all(3, how->background_color))
         return disti_fail(ctx, DIST_NOT_FINITE, "%s: how.background and background_color must be finite", function, 0,
                           0);
@@ -13024,12 +12985,17 @@ DIST_API dist_status dist_mesh_backward(dist_context *ctx, const dist_field *fie
         if (!disti_finite_all(3, d_vertices + 3 * i))
             return disti_fail(ctx, DIST_NOT_FINITE, "dist_mesh_backward: d_vertices of vertex %d is not finite", NULL,
                               (double)i, 0);
-    if (mesh->vertex_count == 0) return dist_field_backward(ctx, field, 0, NULL, NULL, NULL, NULL, NULL, grads);
+    status = dist_field_backward(ctx, field, 0, NULL, NULL, NULL, NULL, NULL, grads);
     for (size_t at = 0; status == DIST_OK && at < mesh->vertex_count; at += CHUNK) {
-        const float *d_chunk = d_vertices + 3 * at;
+        const float *d_chunk = d_vertices + 3 * at, *points = mesh->vertices + 3 * at;
         size_t n = DISTI_MIN(mesh->vertex_count - at, (size_t)CHUNK);
-        status = dist_field_backward(ctx, field, n, mesh->vertices + 3 * at, d_sdf, disti_mesh_seed, &d_chunk, NULL,
-                                     grads);
+        float *gradient = disti_chunk_scratch(ctx);
+        if (grads->weights) { /* their pass has no gradient to seed from */
+            disti_field_eval_all(ctx, field, n, points, d_sdf, gradient);
+            disti_mesh_seed(&d_chunk, 0, n, NULL, gradient, d_sdf);
+        }
+        status = dist_field_backward(ctx, field, n, points, d_sdf, grads->weights ? NULL : disti_mesh_seed, &d_chunk,
+                                     NULL, grads);
     }
     return status;
 }
@@ -14111,6 +14077,8 @@ DIST_API size_t dist_workspace_bytes(const dist_workspace_desc *desc)
 #undef DISTI_MIN
 #undef DISTI_MAX
 #undef DISTI_ANALYTIC
+#undef DISTI_RADIUS_LEAST
+#undef DISTI_RADIUS_MOST
 
 #ifdef __cplusplus
 }

@@ -688,6 +688,13 @@ TEST(a_texture_that_does_not_fit_and_gradients_that_are_not_there_are_refused)
     dist_gradients grads = gradients_of(&s, g);
     CHECK_STATUS(DIST_BAD_ARGUMENT, dist_color_backward(s.ctx, &s.field, 1, x, x, NULL, &grads), s.ctx); /* camera */
     grads.rotation = grads.translation = grads.focal = grads.principal = NULL;
+    float *weights = grads.weights;
+    grads.weights = NULL;
+    dist_context_clear(s.ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_color_backward(s.ctx, &s.field, 1, x, NULL, NULL, &grads), s.ctx);
+    CHECK_TEXT("dist_color_backward: d_color is NULL", dist_context_message(s.ctx));
+    dist_context_clear(s.ctx);
+    grads.weights = weights;
     CHECK_STATUS(DIST_UNSUPPORTED, dist_color_backward(s.ctx, &s.field, 1, x, x, NULL, &grads), s.ctx); /* weights */
     CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_backward(s.ctx, &s.field, 1, x, x, NULL, NULL, NULL, &grads), s.ctx);
     float sphere[4] = {0, 0, 0, 0.5f};

@@ -382,7 +382,9 @@ TEST(null_is_refused_everywhere_without_a_crash)
         dist_context_destroy(ctx);
     }
     CHECK(dist_shape_set_code(NULL, x) < 0);
-    CHECK(dist_shape_field(NULL).eval_fn == NULL);
+    CHECK(dist_shape_field(NULL).eval_fn == NULL && dist_scene_field(NULL).eval_fn == NULL);
+    CHECK(dist_field_sphere(NULL).eval_fn == NULL && dist_field_torus(NULL).eval_fn == NULL);
+    CHECK(dist_field_box(NULL).eval_fn == NULL);
     CHECK_EQUAL(0, dist_net_code_size(NULL));
     CHECK_EQUAL(0, dist_net_code_count(NULL));
     CHECK_EQUAL(0, dist_net_channels(NULL));

@@ -442,6 +442,57 @@ TEST(mesh_adjoint_is_the_central_difference_of_moving_vertices)
     dist_context_destroy(ctx);
 }
 
+/* Against the same seeds given to dist_field_backward, whose weights have tests of their own. */
+TEST(the_mesh_adjoint_reaches_the_weights)
+{
+    dist_context *ctx = test_context();
+    dist_net_desc tiny;
+    memset(&tiny, 0, sizeof tiny);
+    tiny.layers = 2;
+    tiny.width = 16;
+    tiny.geometric = 1;
+    dist_net *net = dist_net_create(ctx, &tiny);
+    dist_shape *shape = dist_shape_create(ctx, net, NULL);
+    dist_field field = dist_shape_field(shape);
+    dist_mesh_desc desc = mesh_desc(48); /* more vertices than are sent back at once */
+    dist_mesh *mesh = dist_mesh_extract(ctx, &field, &desc);
+    REQUIRE(mesh && mesh->vertex_count > 4096);
+    size_t n = mesh->vertex_count, count = dist_net_weight_count(net);
+    float *memory = (float *)calloc(8 * n + 2 * count, sizeof(float));
+    REQUIRE(memory);
+    float *d_vertices = memory, *gradient = d_vertices + 3 * n, *sdf = gradient + 3 * n, *d_sdf = sdf + n;
+    float *d_weights = d_sdf + n, *expected = d_weights + count;
+    test_random r = test_random_seed(5);
+    test_random_fill(&r, 3 * n, d_vertices, -1, 1);
+    dist_gradients grads;
+    memset(&grads, 0, sizeof grads);
+    grads.weights = d_weights;
+    CHECK_STATUS(DIST_OK, dist_mesh_backward(ctx, &field, mesh, d_vertices, &grads), ctx);
+    dist_field_eval(ctx, &field, n, mesh->vertices, sdf, gradient);
+    for (size_t i = 0; i < n; i++) {
+        double dot = 0, square = 0;
+        for (size_t k = 3 * i; k < 3 * i + 3; k++) {
+            dot += (double)gradient[k] * (double)d_vertices[k];
+            square += (double)gradient[k] * (double)gradient[k];
+        }
+        d_sdf[i] = square > 0 ? (float)(-dot / square) : 0.0f;
+    }
+    grads.weights = expected;
+    CHECK_STATUS(DIST_OK, dist_field_backward(ctx, &field, n, mesh->vertices, d_sdf, NULL, NULL, NULL, &grads), ctx);
+    double off = 0, all = 0;
+    for (size_t i = 0; i < count; i++) {
+        off += fabs((double)d_weights[i] - (double)expected[i]);
+        all += fabs((double)expected[i]);
+    }
+    CHECK(all > 1);
+    CHECK_NEAR(0, off / all, 1e-4);
+    free(memory);
+    dist_mesh_destroy(mesh);
+    dist_shape_destroy(shape);
+    dist_net_destroy(net);
+    dist_context_destroy(ctx);
+}
+
 TEST(volume_of_the_extracted_torus_has_the_derivative_of_its_formula)
 {
     dist_context *ctx = test_context();
@@ -709,6 +760,7 @@ int main(int argc, char **argv)
     RUN(a_field_that_is_not_finite_is_refused);
     RUN(extraction_gives_the_same_bits_for_every_worker_count);
     RUN(mesh_adjoint_is_the_central_difference_of_moving_vertices);
+    RUN(the_mesh_adjoint_reaches_the_weights);
     RUN(volume_of_the_extracted_torus_has_the_derivative_of_its_formula);
     RUN(every_allocation_of_an_extraction_may_fail);
     RUN(a_mesh_of_ones_own_is_checked);

@@ -984,6 +984,45 @@ static int refused(dist_context *ctx, const dist_instance *instance, const char 
     return good;
 }
 
+/* Squares of such lengths do not fit a float: a sphere of 1e-20 rendered as nothing at all, without a word. */
+TEST(radii_that_floats_cannot_square_are_refused)
+{
+    dist_context *ctx = test_context();
+    const float radii[7] = {1e-30f, 1e-20f, 0.5e-15f, 2e-15f, 5e14f, 1e20f, 1e30f};
+    for (int i = 0; i < 7; i++) {
+        float sphere[4] = {0, 0, 0, radii[i]}, one[4] = {0, 0, 0, 1.0f}, eye[3] = {0, 0, 2.5f * radii[i]}, depth = 0;
+        dist_field field = dist_field_sphere(sphere), unit = dist_field_sphere(one);
+        dist_camera camera = dist_camera_look_at(1, 1, 0.01f, eye, NULL, NULL);
+        dist_instance instance;
+        dist_images out;
+        memset(&instance, 0, sizeof instance);
+        memset(&out, 0, sizeof out);
+        out.depth = &depth;
+        instance.field = &unit;
+        instance.placement.scale = radii[i];
+        if (i < 3 || i > 4) {
+            CHECK_STATUS(DIST_BAD_ARGUMENT, dist_render(ctx, &field, &camera, NULL, &out, NULL), ctx);
+            refused(ctx, &instance, "must be 1e-15 to 1e15");
+            continue;
+        }
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, NULL), ctx);
+        CHECK_NEAR(1.5, (double)depth / (double)radii[i], 1e-3);
+        dist_scene *scene = dist_scene_create(ctx, 1, &instance);
+        field = dist_scene_field(scene);
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, NULL), ctx);
+        CHECK_NEAR(1.5, (double)depth / (double)radii[i], 1e-3);
+        dist_scene_destroy(scene);
+    }
+    float one[4] = {0, 0, 0, 1.0f};
+    dist_field field = dist_field_sphere(one);
+    dist_instance instance;
+    memset(&instance, 0, sizeof instance);
+    instance.field = &field;
+    field.color_code_size = -1;
+    refused(ctx, &instance, "field.color_code_size is -1, must be 0 or positive");
+    dist_context_destroy(ctx);
+}
+
 TEST(scenes_refuse_what_cannot_be_placed)
 {
     dist_context *ctx = test_context(), *other = test_context();
@@ -1011,7 +1050,7 @@ TEST(scenes_refuse_what_cannot_be_placed)
         float scale, first, second;
         const char *sentence;
     } cases[] = {{-1, 0, 0, "scale is -1"}, {1, 2, 0, "not a rotation"}, {1, 1, 0, "not a rotation"},
-                 {1e38f, 0, 3e38f, "does not fit"}};
+                 {1e38f, 0, 3e38f, "radius is inf"}};
     for (size_t i = 0; i < sizeof cases / sizeof cases[0]; i++) {
         x = good;
         x.placement.scale = cases[i].scale;
@@ -1197,6 +1236,7 @@ int main(int argc, char **argv)
     RUN(a_placement_is_found_from_a_picture_alone_and_with_the_code);
     RUN(a_pixel_pulls_on_the_instance_that_it_shows_alone);
     RUN(moving_a_placement_keeps_it_a_similarity);
+    RUN(radii_that_floats_cannot_square_are_refused);
     RUN(scenes_refuse_what_cannot_be_placed);
     RUN(what_is_not_finite_stays_so);
     RUN(colors_are_those_of_the_instance_that_is_hit);

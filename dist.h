@@ -1617,6 +1617,14 @@ typedef struct disti_kernels {
     /* y[k][c] = (bit c of mask[k]) * w[k] s[c] for the listed rows (NULL: all): its adjoint */
     void (*outer)(const float *w, const float *s, const int *alive, int alive_count, int rows, int columns,
                   const uint64_t *mask, float *y);
+    /* sum[k][c % 16] += s[c] x[k][c] for the listed rows, c < columns: a row's sum in sixteen parts (vectors:
+       other parts) */
+    void (*lanes)(const float *s, const float *x, const int *alive, int alive_count, int rows, int columns, float *sum);
+    /* points (B, 3) to rows (3, B), and back */
+    void (*rows)(const float *points, float *rows);
+    void (*points)(const float *rows, float *points);
+    /* y <- y + s x in double */
+    void (*axpy)(size_t n, double s, const float *x, double *y);
     /* y <- max(0, y) and the bits of the positive lanes of each row */
     void (*relu)(size_t rows, float *y, uint64_t *mask);
     /* y <- activation(y), n values; slope (n) gets its derivative unless NULL */
@@ -1703,6 +1711,16 @@ static void disti_outer_scalar(const float *w, const float *s, const int *alive,
         const size_t k = (size_t)(alive ? alive[i] : i);
         for (int c = 0; c < columns; c++)
             y[k * DISTI_BLOCK + (size_t)c] = mask && !(mask[k] >> c & 1) ? 0.0f : w[k] * s[c];
+    }
+}
+
+static void disti_lanes_scalar(const float *s, const float *x, const int *alive, int alive_count, int rows, int columns,
+                               float *sum)
+{
+    const int count = alive ? alive_count : rows;
+    for (int i = 0; i < count; i++) {
+        const size_t k = (size_t)(alive ? alive[i] : i);
+        for (size_t c = 0; c < (size_t)(unsigned)columns; c++) sum[k * 16 + c % 16] += s[c] * x[k * DISTI_BLOCK + c];
     }
 }
 
@@ -1997,6 +2015,29 @@ DISTI_INLINE void disti_fit(int blocks, int columns, const float *DISTI_RESTRICT
     }
 }
 
+DISTI_INLINE void disti_axpy(size_t n, double s, const float *DISTI_RESTRICT x, double *DISTI_RESTRICT y)
+{
+    for (size_t i = 0; i < n; i++) y[i] += s * (double)x[i];
+}
+
+DISTI_INLINE void disti_rows(const float *DISTI_RESTRICT points, float *DISTI_RESTRICT rows)
+{
+    for (size_t c = 0; c < DISTI_BLOCK; c++) {
+        rows[c] = points[3 * c];
+        rows[DISTI_BLOCK + c] = points[3 * c + 1];
+        rows[2 * DISTI_BLOCK + c] = points[3 * c + 2];
+    }
+}
+
+DISTI_INLINE void disti_points(const float *DISTI_RESTRICT rows, float *DISTI_RESTRICT points)
+{
+    for (size_t c = 0; c < DISTI_BLOCK; c++) {
+        points[3 * c] = rows[c];
+        points[3 * c + 1] = rows[DISTI_BLOCK + c];
+        points[3 * c + 2] = rows[2 * DISTI_BLOCK + c];
+    }
+}
+
 /* These of a block from the same text for every instruction set; scalar is the definition, as above. */
 #define DISTI_PLAIN(isa, function)                                                                                     \
     function void disti_activate_##isa(int activation, float scale, size_t n, float *y, float *slope)                  \
@@ -2012,6 +2053,12 @@ DISTI_INLINE void disti_fit(int blocks, int columns, const float *DISTI_RESTRICT
                                          const float *inverse, float *d)                                               \
     {                                                                                                                  \
         disti_norm_backward(units, gamma, half, hat, inverse, d);                                                      \
+    }                                                                                                                  \
+    function void disti_rows_##isa(const float *points, float *rows) { disti_rows(points, rows); }                     \
+    function void disti_points_##isa(const float *rows, float *points) { disti_points(rows, points); }                 \
+    function void disti_axpy_##isa(size_t n, double s, const float *x, double *y)                                      \
+    {                                                                                                                  \
+        disti_axpy(n, s, x, y);                                                                                        \
     }                                                                                                                  \
     function void disti_top_##isa(size_t out, const float *sum, size_t stride, int cells, const float *cell,           \
                                    float *top)                                                                         \
@@ -2036,6 +2083,7 @@ DISTI_PLAIN(scalar, static)
      DISTI_BITS(row, column, v)         the latter into a mask's row, from this column on
      DISTI_KEEP(v, bits)                v with 0 where the lane's bit is 0
      DISTI_TALL(isa)                    tiles of one vector's columns, where there are registers for sixteen rows
+     DISTI_FEW(isa)                     the reverse pass of up to four rows, where other tiles are higher
      DISTI_DEPTH                        rows that one pass takes: 112 of 192 bytes stay in a first cache of 32 KiB
                                         beside the weights; wider vectors ask for less and can use the second cache
    A tile of R rows and V vectors keeps its sums in variables a<row><vector>: gcc holds those in registers where it
@@ -2279,6 +2327,24 @@ DISTI_PLAIN(scalar, static)
                 DISTI_X3(DISTI_OUTER1, 0)                                                                              \
             }                                                                                                          \
         }                                                                                                              \
+    }                                                                                                                  \
+    DISTI_FUNCTION void disti_lanes_##isa(                                                                             \
+        const float *s, const float *matrix, const int *alive, int alive_count, int rows, int columns, float *sum)     \
+    {                                                                                                                  \
+        const int count = alive ? alive_count : rows;                                                                  \
+        for (int n = 0; n < count; n++) {                                                                              \
+            const size_t k = (size_t)(unsigned)(alive ? alive[n] : n);                                                 \
+            const float *x = matrix + k * DISTI_BLOCK;                                                                 \
+            float *to = sum + k * 16;                                                                                  \
+            DISTI_VEC a = DISTI_LOAD(to);                                                                              \
+            int c = 0;                                                                                                 \
+            for (; c + DISTI_LANES <= columns; c += DISTI_LANES) {                                                     \
+                const DISTI_VEC b = DISTI_LOAD(s + c), x0 = DISTI_LOAD(x + c);                                         \
+                DISTI_FMA(a, b, x0);                                                                                   \
+            }                                                                                                          \
+            DISTI_STORE(to, a);                                                                                        \
+            for (; c < columns; c++) to[0] += s[c] * x[c];                                                             \
+        }                                                                                                              \
     }
 
 /* All tiles of `total` rows, eight at a time: their strips are R rows high where W vectors wide, else eight. */
@@ -2318,6 +2384,7 @@ DISTI_PLAIN(scalar, static)
         do {                                                                                                           \
             const int from = to;                                                                                       \
             to = DISTI_MIN(from + DISTI_DEPTH, count);                                                                 \
+            DISTI_FEW(isa)                                                                                             \
             DISTI_EACH(back, isa, 0, rows, g->columns, R, W,                                                           \
                        (g, disti_back_rows(g, rows, n, k), rows - n, c, from, to))                                     \
         } while (to < count);                                                                                          \
@@ -2415,6 +2482,7 @@ DISTI_FUNCTION __m128 disti_keep_sse2(__m128 v, int bits)
     return _mm_and_ps(v, _mm_castsi128_ps(_mm_cmpeq_epi32(_mm_and_si128(_mm_set1_epi32(bits), lane), lane)));
 }
 #define DISTI_TALL(isa)
+#define DISTI_FEW(isa)
 #define DISTI_DEPTH 112
 DISTI_KERNELS(sse2, 4, 2)
 #define DISTI_ABS(v) _mm_andnot_ps(_mm_set1_ps(-0.0f), v)
@@ -2462,6 +2530,7 @@ DISTI_KERNELS(avx2, 4, 3)
 DISTI_BOUND(avx2)
 #undef DISTI_ABS
 #undef DISTI_TALL
+#undef DISTI_FEW
 #undef DISTI_FUNCTION
 #undef DISTI_VEC
 #undef DISTI_LANES
@@ -2500,8 +2569,15 @@ DISTI_BOUND(avx2)
     for (; g->columns <= DISTI_LANES && first + 16 <= out; first += 16)                                                \
         disti_gemm_tall_##isa(g, first, 0, from, to, ahead);
 DISTI_GEMM_TILE(tall_avx512, 16, 1, DISTI_ABOVE)
+#define DISTI_FEW(isa)                                                                                                 \
+    if (rows > 0 && rows <= 4 && g->columns > 2 * DISTI_LANES) {                                                       \
+        disti_back_few_##isa(g, disti_back_rows(g, rows, 0, k), rows, 0, from, to);                                    \
+        continue;                                                                                                      \
+    }
+DISTI_BACK_TILE(few_avx512, 4, 3)
 DISTI_KERNELS(avx512, 8, 3)
 #undef DISTI_TALL
+#undef DISTI_FEW
 
 #ifdef DISTI_HALF
 /* A hidden layer in 16 bits: f16 by AVX512-FP16, or pairs of inputs by AVX512-BF16, from one text as above. A vector's
@@ -2722,6 +2798,7 @@ static float32x4_t disti_keep_neon(float32x4_t v, uint32_t bits)
     return vreinterpretq_f32_u32(vandq_u32(vreinterpretq_u32_f32(v), vtstq_u32(vdupq_n_u32(bits), vld1q_u32(lane))));
 }
 #define DISTI_TALL(isa)
+#define DISTI_FEW(isa)
 #define DISTI_DEPTH 112
 DISTI_KERNELS(neon, 8, 3)
 #define DISTI_ABS(v) vabsq_f32(v)
@@ -2749,6 +2826,10 @@ static uint32_t disti_f16_bits(float x) /* not called: dist_net_set_half refuses
     kernels.gemm_weights = disti_gemm_weights_##isa; \
     kernels.dot = disti_dot_##isa; \
     kernels.outer = disti_outer_##isa; \
+    kernels.lanes = disti_lanes_##isa; \
+    kernels.axpy = disti_axpy_##isa; \
+    kernels.rows = disti_rows_##isa; \
+    kernels.points = disti_points_##isa; \
     kernels.relu = disti_relu_##isa; \
     kernels.activate = disti_activate_##isa; \
     kernels.top = disti_top_##isa; \
@@ -2844,6 +2925,7 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_BITS
 #undef DISTI_KEEP
 #undef DISTI_TALL
+#undef DISTI_FEW
 #undef DISTI_DEPTH
 #undef DISTI_MAC_LANE
 #undef DISTI_TABLE
@@ -5128,13 +5210,14 @@ typedef struct disti_block {
     float *d_point;    /* its gradient */
     float *act[2];     /* (max_rows, B): a layer's input */
     float *delta[2];   /* (max_rows, B): dL/d(pre-activation) */
-    float *fold_delta; /* (fold_count, max_rows, B): that of the layers that see the code, until the seeds are known */
+    float *fold_delta; /* (fold_count, max_rows, B): that of the layers that see the code, alive rows */
     uint64_t *mask;    /* (layers, max_rows): which lanes of a layer's input rows are alive */
     int *alive;        /* (layers, max_rows): rows of a layer's input that are alive anywhere in the block */
     float *slope;      /* (layers, max_rows, B): activation's derivative; not for ReLU */
     float *hat;        /* (layers, max_rows, B): LayerNorm's normalized values */
     float *inverse;    /* (layers, B): and its 1 / sigma */
-    double *fold_sum;  /* (fold_count, max_rows) */
+    float *fold_lanes; /* (fold_count, max_rows, 16): parts of the sums of fold_delta over points, of few blocks */
+    double *fold_sum;  /* (fold_count, max_rows): the sums */
     float *tail;       /* (8, B): sdf, slope and curvature of the output, seed; (3 B): gradient */
     int alive_count[DISTI_MAX_LAYERS];
     int alive_units[DISTI_MAX_LAYERS]; /* of them, units: those before the encoded point's rows */
@@ -5142,6 +5225,7 @@ typedef struct disti_block {
     int values; /* no reverse pass follows: masks and slopes need not be kept */
     int channel, channels; /* the output's channels that the reverse pass starts from: the distance, or r, g, b */
     int half; /* 0; or B / 2: lane c + half is the tangent of lane c, see disti_second_block */
+    disti_kernels kernels;
     const float *last; /* the output channel's weights for the rows at hand; NULL: as the net has them */
 } disti_block;
 
@@ -5165,6 +5249,7 @@ static size_t disti_block_layout(const dist_net *net, unsigned char *base, disti
         b->hat = (float *)disti_take(base, &at, layers * rows, row);
         b->inverse = (float *)disti_take(base, &at, layers, row);
     }
+    b->fold_lanes = (float *)disti_take(base, &at, (size_t)net->fold_count * rows, 16 * sizeof(float));
     b->fold_sum = (double *)disti_take(base, &at, (size_t)net->fold_count * rows, sizeof(double));
     b->tail = (float *)disti_take(base, &at, 11, row);
     return at;
@@ -5206,18 +5291,16 @@ static int disti_encoding_row(const dist_net *net, int level, int axis, int cosi
     return first + (second ? half : 0) + 3 * level + axis;
 }
 
-static void disti_encode(const dist_net *net, size_t n, const float *points, float *rows)
+static void disti_encode(const dist_net *net, const disti_kernels *kernels, size_t n, const float *points, float *rows)
 {
     /* idle lanes repeat the last point: no unit lives for them alone */
-    for (size_t c = 0; c < DISTI_BLOCK && net->raw; c++) {
-        const float *p = points + 3 * (c < n ? c : n - 1);
-        const float x = p[0], y = p[1], z = p[2];
-        rows[c] = x;
-        rows[DISTI_BLOCK + c] = y;
-        rows[2 * DISTI_BLOCK + c] = z;
-    }
+    float last[3 * DISTI_BLOCK];
+    for (size_t c = 0; c < DISTI_BLOCK && n < DISTI_BLOCK; c++)
+        memcpy(last + 3 * c, points + 3 * (c < n ? c : n - 1), 3 * sizeof(float));
+    if (n < DISTI_BLOCK) points = last;
+    if (net->raw) kernels->rows(points, rows);
     for (size_t c = 0; c < DISTI_BLOCK && net->levels > 0; c++) {
-        const float *p = points + 3 * (c < n ? c : n - 1);
+        const float *p = points + 3 * c;
         for (int axis = 0; axis < 3; axis++) {
             double s, co;
             disti_sincos(net->base * (double)p[axis], &s, &co);
@@ -5238,6 +5321,10 @@ static void disti_encode_backward(const dist_net *net, const disti_block *b, flo
 {
     const float *rows = b->point, *d_rows = b->d_point;
     size_t half = (size_t)b->half;
+    if (net->raw && net->levels == 0) {
+        b->kernels.points(d_rows, d_points);
+        return;
+    }
     for (size_t c = 0; c < (half ? half : (size_t)DISTI_BLOCK); c++) {
         for (int axis = 0; axis < 3; axis++) {
             float sum = net->raw ? d_rows[(size_t)axis * DISTI_BLOCK + c] : 0.0f;
@@ -5282,19 +5369,22 @@ static void disti_list_alive(const dist_shape *shape, disti_block *b, int l)
     const disti_linear *layer = &net->layer[l];
     uint64_t *mask = b->mask + (size_t)l * (size_t)net->max_rows;
     int *alive = b->alive + (size_t)l * (size_t)net->max_rows;
-    int count = 0;
+    int count = 0, u = 0;
     b->alive_units[l] = layer->prev;
     b->alive_count[l] = layer->prev + layer->point;
     if (disti_all_alive(shape, b, l)) return; /* no list: nobody reads one that leaves nothing out */
-    for (int u = 0; u < layer->prev; u++) {
+    for (int i = 0; i < layer->point; i++) mask[layer->prev + i] = ~(uint64_t)0;
+    for (; u + 4 <= layer->prev; u += 4) /* bit 63 of m - 1 says that no lane's bit is set in m */
+        if (((mask[u] - 1) | (mask[u + 1] - 1) | (mask[u + 2] - 1) | (mask[u + 3] - 1)) >> 63) break;
+    while (u < layer->prev && mask[u]) u++;
+    if (u == layer->prev) return;
+    for (; count < u; count++) alive[count] = count;
+    for (; u < layer->prev; u++) {
         alive[count] = u;
         count += mask[u] != 0;
     }
     b->alive_units[l] = count;
-    for (int i = 0; i < layer->point; i++) {
-        mask[layer->prev + i] = ~(uint64_t)0;
-        alive[count++] = layer->prev + i;
-    }
+    for (int i = 0; i < layer->point; i++) alive[count++] = layer->prev + i;
     b->alive_count[l] = count;
 }
 
@@ -5418,7 +5508,6 @@ static void disti_hidden(const dist_shape *shape, const disti_kernels *kernels, 
 static const float *disti_net_forward(const dist_shape *shape, disti_block *b, float *store, disti_counter *counter)
 {
     const dist_net *net = shape->net;
-    disti_kernels kernels = disti_kernels_for(shape->ctx->isa);
     const float *x = b->point;
     double done = 0.0;
     disti_list_alive(shape, b, 0);
@@ -5430,7 +5519,7 @@ static const float *disti_net_forward(const dist_shape *shape, disti_block *b, f
                             store + disti_store_offset(net, l, DISTI_STORE_INPUT));
         done += (double)b->alive_count[l] * layer->out;
         if (l + 1 == net->layers) break;
-        disti_hidden(shape, &kernels, b, l, x, b->act[l & 1]);
+        disti_hidden(shape, &b->kernels, b, l, x, b->act[l & 1]);
         x = b->act[l & 1];
     }
     counter->done += done * b->columns;
@@ -5446,11 +5535,10 @@ static void disti_net_output(const dist_shape *shape, const disti_block *b, cons
     int l = net->layers - 1;
     const disti_linear *layer = &net->layer[l];
     int rows = layer->prev + layer->point;
-    disti_kernels kernels = disti_kernels_for(shape->ctx->isa);
     const int *alive = b->alive_count[l] < rows ? b->alive + (size_t)l * (size_t)net->max_rows : NULL;
     float bias = shape->bias[(size_t)l * (size_t)net->max_rows + (size_t)channel];
     const float *w = b->last ? b->last : net->panels + layer->panel + (size_t)channel * (size_t)rows;
-    kernels.dot(w, b->half ? 0.0f : bias, x, alive, b->alive_count[l], rows, b->columns, value);
+    b->kernels.dot(w, b->half ? 0.0f : bias, x, alive, b->alive_count[l], rows, b->columns, value);
     float v[DISTI_BLOCK], d[DISTI_BLOCK], t[DISTI_BLOCK], bend[DISTI_BLOCK];
     float level = channel == net->sdf_channel ? net->level : 0.0f;
     int twice = net->output == DISTI_OUTPUT_TANH_TWICE;
@@ -5461,7 +5549,7 @@ static void disti_net_output(const dist_shape *shape, const disti_block *b, cons
         bend[c] = 0.0f;
     }
     for (int k = 0; k < twice + (twice || net->output == DISTI_OUTPUT_TANH); k++) {
-        kernels.activate(DIST_ACTIVATION_TANH, 1.0f, DISTI_BLOCK, v, b->values ? NULL : t);
+        b->kernels.activate(DIST_ACTIVATION_TANH, 1.0f, DISTI_BLOCK, v, b->values ? NULL : t);
         for (size_t c = 0; c < DISTI_BLOCK && !b->values; c++) {
             bend[c] = t[c] * (bend[c] - 2.0f * v[c] * d[c] * d[c]); /* of t(v): t'' v'^2 + t' v'' */
             d[c] *= t[c];
@@ -5574,7 +5662,7 @@ static void disti_add_point_rows(const disti_linear *layer, const float *d_x, fl
     for (size_t i = 0; i < (size_t)layer->point * DISTI_BLOCK; i++) d_point[i] += from[i];
 }
 
-/* Keeps layer l's delta, its dead rows as zeros: for the code (to) or for the weights (to a store). */
+/* Keeps layer l's delta for the weights, its dead rows as zeros. */
 static void disti_keep_delta(const dist_net *net, const disti_block *b, int l, const float *delta, float *to)
 {
     const uint64_t *mask = b->mask + (size_t)(l + 1) * (size_t)net->max_rows;
@@ -5606,30 +5694,35 @@ static void disti_output_backward(const dist_shape *shape, const disti_kernels *
     }
 }
 
+/* Where layer l's delta goes: what the code's gradient needs is kept. fold: how many layers up to l see the code. */
+static float *disti_delta_room(const dist_net *net, const disti_block *b, int l, int *fold)
+{
+    if (l < 0 || !net->layer[l].code) return b->delta[(l + 1) & 1];
+    return b->fold_delta + (size_t)--*fold * (size_t)net->max_rows * DISTI_BLOCK;
+}
+
 /* Reverse pass of one block from the seeds (channels, B) at the last layer's pre-activation: leaves the encoded
    point's gradient in b->d_point and the deltas of the layers that see the code in b->fold_delta; store, unless NULL,
    gets all deltas. */
 static void disti_net_reverse(const dist_shape *shape, disti_block *b, const float *seed, float *store)
 {
     const dist_net *net = shape->net;
-    disti_kernels kernels = disti_kernels_for(shape->ctx->isa);
     int last = net->layers - 1, fold = net->fold_count;
-    size_t width = (size_t)net->max_rows, seeds = (size_t)b->channels * DISTI_BLOCK * sizeof(float);
+    size_t seeds = (size_t)b->channels * DISTI_BLOCK * sizeof(float);
     const disti_linear *layer = &net->layer[last];
     memset(b->d_point, 0, (size_t)net->point_size * DISTI_BLOCK * sizeof(float));
-    float *delta = b->delta[last & 1];
-    disti_output_backward(shape, &kernels, b, seed, delta);
-    disti_add_point_rows(layer, delta, b->d_point);
     if (store) memcpy(store + disti_store_offset(net, last, DISTI_STORE_DELTA), seed, seeds);
-    if (layer->code) memcpy(b->fold_delta + (size_t)--fold * width * DISTI_BLOCK, seed, seeds);
+    if (layer->code) memcpy(disti_delta_room(net, b, last, &fold), seed, seeds);
+    float *delta = disti_delta_room(net, b, last - 1, &fold);
+    disti_output_backward(shape, &b->kernels, b, seed, delta);
+    disti_add_point_rows(layer, delta, b->d_point);
     for (int l = last - 1; l >= 0; l--) {
         layer = &net->layer[l];
-        disti_hidden_delta(net, &kernels, b, l, delta,
+        disti_hidden_delta(net, &b->kernels, b, l, delta,
                            store ? store + disti_store_offset(net, l, DISTI_STORE_NORM) : NULL);
-        if (layer->code) disti_keep_delta(net, b, l, delta, b->fold_delta + (size_t)--fold * width * DISTI_BLOCK);
         if (store) disti_keep_delta(net, b, l, delta, store + disti_store_offset(net, l, DISTI_STORE_DELTA));
-        float *d_x = b->delta[l & 1];
-        disti_linear_backward(shape, &kernels, b, l, delta, d_x);
+        float *d_x = disti_delta_room(net, b, l - 1, &fold);
+        disti_linear_backward(shape, &b->kernels, b, l, delta, d_x);
         disti_add_point_rows(layer, d_x, b->d_point);
         delta = d_x;
     }
@@ -5639,6 +5732,7 @@ static void disti_net_reverse(const dist_shape *shape, disti_block *b, const flo
 static void disti_blocks_begin(const dist_shape *shape, int worker, disti_block *b, size_t n)
 {
     disti_block_layout(shape->net, disti_lane(shape->ctx, worker), b);
+    b->kernels = disti_kernels_for(shape->ctx->isa);
     disti_counter_of(shape->ctx, worker)->dense += (double)dist_net_operations(shape->net, 1) * (double)n;
 }
 
@@ -5648,7 +5742,7 @@ static void disti_block_load(const dist_shape *shape, disti_block *b, size_t n, 
     b->columns = (int)n;
     b->channel = shape->net->sdf_channel;
     b->channels = 1;
-    disti_encode(shape->net, n, points, b->point);
+    disti_encode(shape->net, &b->kernels, n, points, b->point);
 }
 
 static void disti_block_begin(const dist_shape *shape, int worker, disti_block *b, size_t n, const float *points)
@@ -5657,11 +5751,35 @@ static void disti_block_begin(const dist_shape *shape, int worker, disti_block *
     disti_block_load(shape, b, n, points);
 }
 
+/* Sums over no points yet. */
+static void disti_fold_begin(const dist_net *net, disti_block *b)
+{
+    size_t rows = (size_t)net->fold_count * (size_t)net->max_rows;
+    memset(b->fold_lanes, 0, rows * 16 * sizeof(float));
+    memset(b->fold_sum, 0, rows * sizeof(double));
+}
+
+/* Parts to sums, before they get long. */
+static void disti_fold_flush(const dist_net *net, disti_block *b)
+{
+    size_t rows = (size_t)net->fold_count * (size_t)net->max_rows;
+    for (size_t o = 0; o < rows; o++) {
+        const float *part = b->fold_lanes + 16 * o;
+        double sum[4] = {0, 0, 0, 0};
+        for (size_t c = 0; c < 16; c += 4)
+            for (size_t i = 0; i < 4; i++) sum[i] += (double)part[c + i];
+        b->fold_sum[o] += sum[0] + sum[1] + (sum[2] + sum[3]);
+    }
+    memset(b->fold_lanes, 0, rows * 16 * sizeof(float));
+}
+
 /* d_code += sum over the layers that see the code of scale W_code^T S,  S[o] = sum over points of delta[o], for `count`
    numbers of the net's code from `first`. */
-static void disti_fold_backward(const dist_net *net, const disti_block *b, size_t first, size_t count, double *d_code)
+static void disti_fold_backward(const dist_shape *shape, disti_block *b, size_t first, size_t count, double *d_code)
 {
+    const dist_net *net = shape->net;
     size_t fold = 0;
+    disti_fold_flush(net, b);
     for (int l = 0; l < net->layers; l++) {
         const disti_linear *layer = &net->layer[l];
         if (!layer->code) continue;
@@ -5671,29 +5789,31 @@ static void disti_fold_backward(const dist_net *net, const disti_block *b, size_
         for (size_t o = 0; o < out; o++) {
             const float *w = net->params + layer->weight + (o + row) * (size_t)layer->in + layer->code_column;
             double s = sum[o] * (double)layer->scale;
-            if (s == 0.0) continue;
-            for (size_t j = 0; j < count; j++) d_code[j] += s * (double)w[first + j];
+            if (s != 0.0) b->kernels.axpy(count, s, w + first, d_code);
         }
     }
 }
 
-/* S += sum_c seed[c] delta[o][c], over the block's own lanes but tangents. seed NULL: ones. */
-static void disti_fold_sum(const dist_net *net, const disti_block *b, const float *seed)
+/* S += sum_c seed[c] delta[o][c], over the block's own lanes but tangents. seed NULL: ones. index: of
+   the block. */
+static void disti_fold_sum(const dist_shape *shape, disti_block *b, const float *seed, size_t index)
 {
-    size_t fold = 0;
+    const dist_net *net = shape->net;
+    size_t fold = 0, width = (size_t)net->max_rows;
+    int sparse = net->activation == DIST_ACTIVATION_RELU && !net->normed;
+    float ones[DISTI_BLOCK];
+    for (size_t c = 0; c < DISTI_BLOCK && !seed; c++) ones[c] = 1.0f;
     for (int l = 0; l < net->layers; l++) {
         const disti_linear *layer = &net->layer[l];
         if (!layer->code) continue;
-        size_t out = (size_t)(l + 1 == net->layers ? b->channels : layer->out);
-        const float *delta = b->fold_delta + fold * (size_t)net->max_rows * DISTI_BLOCK;
-        double *sum = b->fold_sum + fold++ * (size_t)net->max_rows;
-        for (size_t o = 0; o < out; o++) {
-            float part = 0.0f;
-            for (size_t c = 0; c < (size_t)(b->columns - b->half); c++)
-                part += (seed ? seed[c] : 1.0f) * delta[o * DISTI_BLOCK + c];
-            sum[o] += (double)part;
-        }
+        int last = l + 1 == net->layers, rows = last ? b->channels : layer->out;
+        int listed = !last && sparse && b->alive_units[l + 1] < rows;
+        b->kernels.lanes(seed ? seed : ones, b->fold_delta + fold * width * DISTI_BLOCK,
+                      listed ? b->alive + (size_t)(l + 1) * width : NULL, listed ? b->alive_units[l + 1] : rows, rows,
+                      b->columns - b->half, b->fold_lanes + fold * width * 16);
+        fold++;
     }
+    if (index % 16 == 15) disti_fold_flush(net, b);
 }
 
 /* dist_field.fused_fn of a net. The reverse pass runs from f's own slope (seed 1), so that it leaves grad f; delta
@@ -5706,7 +5826,7 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
     disti_block b;
     disti_blocks_begin(shape, worker, &b, n);
     b.values = !gradient && !seed_fn;
-    if (d_code) memset(b.fold_sum, 0, (size_t)net->fold_count * (size_t)net->max_rows * sizeof(double));
+    if (d_code) disti_fold_begin(net, &b);
     for (size_t at = 0; at < n; at += DISTI_BLOCK) {
         size_t count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK);
         disti_block_load(shape, &b, count, points + 3 * at);
@@ -5721,9 +5841,9 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
         if (gradient) memcpy(gradient + 3 * at, g, 3 * count * sizeof(float));
         if (!seed_fn) continue;
         seed_fn(seed_user, at, count, value, g, seed);
-        if (d_code) disti_fold_sum(net, &b, seed);
+        if (d_code) disti_fold_sum(shape, &b, seed, at / DISTI_BLOCK);
     }
-    if (d_code) disti_fold_backward(net, &b, 0, (size_t)net->code_size, d_code);
+    if (d_code) disti_fold_backward(shape, &b, 0, (size_t)net->code_size, d_code);
 }
 
 #ifndef DIST_NO_BACKWARD
@@ -5782,14 +5902,14 @@ static void disti_shape_second(void *user, int worker, size_t n, const float *po
     const dist_net *net = shape->net;
     disti_block b;
     disti_block_layout(net, disti_lane(shape->ctx, worker), &b);
-    if (d_code) memset(b.fold_sum, 0, (size_t)net->fold_count * (size_t)net->max_rows * sizeof(double));
+    if (d_code) disti_fold_begin(net, &b);
     for (size_t at = 0; at < n; at += DISTI_BLOCK / 2) {
         size_t count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK / 2);
         const float *g = disti_second_block(shape, worker, &b, count, points + 3 * at, directions + 3 * at, NULL);
         for (size_t i = 0; d_points && i < 3 * count; i++) d_points[3 * at + i] += g[i];
-        if (d_code) disti_fold_sum(net, &b, NULL);
+        if (d_code) disti_fold_sum(shape, &b, NULL, at / DISTI_BLOCK);
     }
-    if (d_code) disti_fold_backward(net, &b, 0, (size_t)net->code_size, d_code);
+    if (d_code) disti_fold_backward(shape, &b, 0, (size_t)net->code_size, d_code);
 }
 #endif
 
@@ -6187,6 +6307,7 @@ static int disti_group_eval(const dist_shape *shape, int worker, disti_group *g,
     const disti_linear *layer = &net->layer[last];
     const float *w = net->panels + layer->panel + (size_t)net->sdf_channel * (size_t)(layer->prev + layer->point);
     for (int j = 0; j < g->count; j++) g->panels[j] = w[g->list[j]];
+    b->kernels = kernels;
     b->last = g->panels;
     b->values = 1;
     for (int j = 0; j < g->blocks; j++) {
@@ -6287,8 +6408,8 @@ static void disti_shape_coarse(void *user, int worker, size_t n, const float *po
         memset(&h, 0, sizeof h);
         disti_block_begin(shape, worker, &b, first, points + 3 * at);
         if (wide > DISTI_BLOCK) /* idle lanes repeat a point here too */
-            disti_encode(net, count > first ? count - first : 1, points + 3 * (at + (count > first ? first : 0)),
-                         b.d_point);
+            disti_encode(net, &kernels, count > first ? count - first : 1,
+                         points + 3 * (at + (count > first ? first : 0)), b.d_point);
         counter->dense += (double)dist_net_operations(net, 1) * (double)(count - first);
         h.points[0] = b.point;
         h.points[1] = b.d_point;
@@ -6369,7 +6490,7 @@ static void disti_shape_color_adjoint_fn(void *user, int worker, size_t n, const
     size_t own = (size_t)((const dist_shape *)user)->net->code_size;
     disti_block b;
     disti_block_layout(net, disti_lane(paint->ctx, worker), &b);
-    memset(b.fold_sum, 0, (size_t)net->fold_count * (size_t)net->max_rows * sizeof(double));
+    disti_fold_begin(net, &b);
     for (size_t at = 0; at < n; at += DISTI_BLOCK) {
         size_t count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK);
         disti_block_begin(paint, worker, &b, count, points + 3 * at);
@@ -6378,10 +6499,10 @@ static void disti_shape_color_adjoint_fn(void *user, int worker, size_t n, const
         if (d_points) disti_encode_backward(net, &b, g);
         for (size_t i = 0; d_points && i < 3 * count; i++) d_points[3 * at + i] += g[i];
         for (size_t c = 0; c < DISTI_BLOCK; c++) ones[c] = 1.0f;
-        if (d_code || d_color_code) disti_fold_sum(net, &b, ones);
+        if (d_code || d_color_code) disti_fold_sum(paint, &b, ones, at / DISTI_BLOCK);
     }
-    if (d_code) disti_fold_backward(net, &b, 0, own, d_code);
-    if (d_color_code) disti_fold_backward(net, &b, own, (size_t)net->code_size - own, d_color_code);
+    if (d_code) disti_fold_backward(paint, &b, 0, own, d_code);
+    if (d_color_code) disti_fold_backward(paint, &b, own, (size_t)net->code_size - own, d_color_code);
 }
 #endif
 
@@ -6482,9 +6603,9 @@ static void disti_weights_block(void *arg, int index, int worker)
     disti_weights_drop(net, job->directions ? (size_t)DISTI_BLOCK : count, store);
     for (size_t i = 0; job->d_points && i < 3 * count; i++) job->d_points[3 * at + i] += pull[i];
     if (!job->d_code) return;
-    memset(b.fold_sum, 0, (size_t)net->fold_count * (size_t)net->max_rows * sizeof(double));
-    disti_fold_sum(net, &b, NULL);
-    disti_fold_backward(net, &b, 0, (size_t)net->code_size, job->d_code + (size_t)index * (size_t)net->code_size);
+    disti_fold_begin(net, &b);
+    disti_fold_sum(shape, &b, NULL, 0);
+    disti_fold_backward(shape, &b, 0, (size_t)net->code_size, job->d_code + (size_t)index * (size_t)net->code_size);
 }
 
 enum { DISTI_WEIGHT_ROWS = 64 }; /* outputs of one task of the second phase */

@@ -36,7 +36,8 @@ static double reference(const dist_shape *shape, const float *p, double *bound)
     static float rows[128 * DISTI_BLOCK];
     const dist_net *net = shape->net;
     int f16 = net->half == DIST_HALF_F16, at = 0;
-    disti_encode(net, 1, p, rows);
+    disti_kernels kernels = disti_kernels_for(DIST_ISA_SCALAR);
+    disti_encode(net, &kernels, 1, p, rows);
     for (int l = 0; l < net->layers; l++, at ^= 1) {
         const disti_linear *layer = &net->layer[l];
         int last = l + 1 == net->layers, count = layer->prev + layer->point;

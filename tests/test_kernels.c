@@ -302,6 +302,63 @@ static void check_outer_case(const disti_kernels *kernels, test_random *random, 
     release(before, n);
 }
 
+static void check_lanes_case(const disti_kernels *kernels, test_random *random, test_size size, int with_list)
+{
+    int list[TEST_LONGEST];
+    const int *alive = with_list ? list : NULL;
+    const int count = with_list ? random_list(random, size.rows, list) : size.rows;
+    const size_t n = (size_t)size.rows * 16;
+    float *x = block(random, size.rows, size.columns, alive, count), *s = block(random, 1, size.columns, NULL, 0);
+    float *sum = floats(n), *before = floats(n);
+    test_random_fill(random, n, before, -1.0f, 1.0f);
+    memcpy(sum, before, n * sizeof *sum);
+    kernels->lanes(s, x, alive, count, size.rows, size.columns, sum);
+    for (int k = 0, listed = 0; k < size.rows; k++) {
+        double expected = 0, got = 0, size_sum = 0;
+        if (alive && !(listed < count && list[listed] == k)) {
+            CHECK_BYTES(16 * sizeof *sum, before + 16 * k, sum + 16 * k);
+            continue;
+        }
+        listed++;
+        for (int i = 0; i < 16; i++) {
+            expected += (double)before[16 * k + i];
+            got += (double)sum[16 * k + i];
+            size_sum += fabs((double)before[16 * k + i]);
+        }
+        for (int c = 0; c < size.columns; c++) {
+            const double term = (double)s[c] * (double)x[k * TEST_BLOCK + c];
+            expected += term;
+            size_sum += fabs(term);
+        }
+        CHECK_NEAR(expected, got, bound(size.columns + 16, size_sum));
+    }
+    release(x, (size_t)size.rows * TEST_BLOCK);
+    release(s, TEST_BLOCK);
+    release(sum, n);
+    release(before, n);
+}
+
+/* Rows of points and back, and y + s x in double. */
+static void check_points_case(const disti_kernels *kernels, test_random *random, test_size size)
+{
+    float *points = floats(3 * TEST_BLOCK), *rows = floats(3 * TEST_BLOCK), *back = floats(3 * TEST_BLOCK);
+    double y[TEST_LONGEST];
+    float x[TEST_LONGEST];
+    test_random_fill(random, 3 * TEST_BLOCK, points, -1.0f, 1.0f);
+    kernels->rows(points, rows);
+    for (int i = 0; i < 3 * TEST_BLOCK; i++)
+        CHECK_BYTES(sizeof *rows, points + i, rows + i % 3 * TEST_BLOCK + i / 3);
+    kernels->points(rows, back);
+    CHECK_BYTES(3 * TEST_BLOCK * sizeof *points, points, back);
+    test_random_fill(random, (size_t)size.rows, x, -1.0f, 1.0f);
+    for (int i = 0; i < size.rows; i++) y[i] = 1.0 / (i + 1);
+    kernels->axpy((size_t)size.rows, 0.3, x, y);
+    for (int i = 0; i < size.rows; i++) CHECK_NEAR(1.0 / (i + 1) + 0.3 * (double)x[i], y[i], 1e-15);
+    release(points, 3 * TEST_BLOCK);
+    release(rows, 3 * TEST_BLOCK);
+    release(back, 3 * TEST_BLOCK);
+}
+
 /* ReLU with its bits, every activation with its slope, LayerNorm and its adjoint, against the scalar kernels,
    which test_net and test_gradients hold against the formulas. */
 static void check_plain_case(const disti_kernels *kernels, test_random *random, test_size size)
@@ -422,7 +479,7 @@ static void check_same_bits(const disti_kernels *kernels, test_random *random, t
     release(y, (size_t)padded * TEST_BLOCK);
 }
 
-enum { GEMM, BACK, WEIGHTS, DOT, OUTER, PLAIN, ZERO_ROWS, FEWER_COLUMNS };
+enum { GEMM, BACK, WEIGHTS, DOT, OUTER, LANES, PLAIN, ZERO_ROWS, FEWER_COLUMNS };
 
 static void check_all_sizes(int isa, int what)
 {
@@ -438,6 +495,8 @@ static void check_all_sizes(int isa, int what)
             if (what == WEIGHTS && variant < 2) check_weights_case(&kernels, &random, size, variant * (n % 7));
             if (what == DOT && variant < 2) check_dot_case(&kernels, &random, size, variant);
             if (what == OUTER) check_outer_case(&kernels, &random, size, variant & 1, variant >> 1);
+            if (what == LANES && variant < 2) check_lanes_case(&kernels, &random, size, variant);
+            if (what == LANES && variant == 2) check_points_case(&kernels, &random, size);
             if (what == PLAIN && variant == 0 && n % 7 == 0) check_plain_case(&kernels, &random, size);
             if (size.out > 70) continue;
             if (what == ZERO_ROWS && variant < 2) check_same_bits(&kernels, &random, size, 1, variant);
@@ -455,6 +514,7 @@ static void check_all_sizes(int isa, int what)
     TEST(gemm_weights_of_##name##_is_its_formula_and_leaves_gaps_alone) { check_all_sizes(isa, WEIGHTS); }  \
     TEST(dot_of_##name##_is_its_formula) { check_all_sizes(isa, DOT); }                                     \
     TEST(outer_of_##name##_is_its_formula_and_writes_listed_rows_only) { check_all_sizes(isa, OUTER); }     \
+    TEST(sums_over_lanes_and_points_of_##name##_are_their_formulas) { check_all_sizes(isa, LANES); }        \
     TEST(element_by_element_##name##_does_what_scalar_does) { check_all_sizes(isa, PLAIN); }                \
     TEST(leaving_out_zero_rows_changes_no_bit_with_##name) { check_all_sizes(isa, ZERO_ROWS); }             \
     TEST(a_column_does_not_depend_on_their_number_with_##name) { check_all_sizes(isa, FEWER_COLUMNS); }
@@ -465,6 +525,7 @@ static void check_all_sizes(int isa, int what)
     RUN(gemm_weights_of_##name##_is_its_formula_and_leaves_gaps_alone); \
     RUN(dot_of_##name##_is_its_formula);                             \
     RUN(outer_of_##name##_is_its_formula_and_writes_listed_rows_only); \
+    RUN(sums_over_lanes_and_points_of_##name##_are_their_formulas);  \
     RUN(element_by_element_##name##_does_what_scalar_does);          \
     RUN(leaving_out_zero_rows_changes_no_bit_with_##name);           \
     RUN(a_column_does_not_depend_on_their_number_with_##name)

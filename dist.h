@@ -10801,16 +10801,16 @@ static void disti_tile_trim(const disti_render_job *job, disti_tile *tile, const
    prediction), or a quarter of those where the corners around moved alike to within epsilon; the others lie between
    such that moved alike, and are moved with them, else they take a query, too. The quarters take turns, so no error
    lives longer than 15 turns.
-   Misses. Where the cones stopped again, the least |f| is known to within what the largest change of f seen in the tile
-   takes off it each turn, or with a silhouette to within what disti_warm_drifts interpolates. Once that may have
-   brought it near, f is asked for where it was least, and when it is near, by samples on both sides how low it is now:
-   a crossing is bracketed on the spot, what stays undecided is marched.
+   Misses. Where the cones stopped again, the least |f| is known to within what the change of f at the hits around takes
+   off it each turn (disti_warm_loss), or with a silhouette to within what disti_warm_drifts interpolates. Once that
+   may have brought it near, f is asked for where it was least, and when it is near, by samples on both sides how low it
+   is now: a crossing is bracketed on the spot, what stays undecided is marched.
    What has a nearer hit beside it, not of the same slant, may be covered by that: from the nearer one's distance on,
    the least f is looked for likewise, again when the bound found is used up; misses take turns at it.
    Rays that start inside do so until the change of f may have brought them out.
    All is off for rays where f at the cones' stop is too small for the surface expected (as in disti_predict) and the
-   cones prove less to be empty than when the ray was traced, and for tiles where the pixels marched anew (one hit in
-   128 each turn) or the first ones contradict what is expected. */
+   cones prove less to be empty than when the ray was traced, for tiles where the first pixels contradict what is
+   expected, and around those of the pixels marched anew (one hit in 128 each turn) that do. */
 enum { DISTI_WARM_HITS = 128, DISTI_WARM_MISSES = 64, DISTI_WARM_MINIMA = 8 };
 
 typedef struct disti_warm {
@@ -10852,7 +10852,7 @@ static int disti_warm_expects(const disti_warm *warm, int i, float s)
     const disti_ray *ray = &warm->bench->rays[i];
     float slope = warm->tape->value[pixel];
     if (warm->open[i] != 1 || ray->mode == DISTI_DONE || (warm->tape->status[pixel] & 15) != DIST_RAY_HIT) return 0;
-    if (!(slope < -0.04f * warm->tracer->lipschitz) || !(s > ray->start && s < ray->leave)) return 0;
+    if (!(slope < -2e-3f * warm->tracer->lipschitz) || !(s > ray->enter && s < ray->leave)) return 0;
     if (ray->guard > 2e38f) return 0; /* no cone came here */
     return -slope * (s - ray->start) <= ray->guard || disti_warm_reaches(warm, i);
 }
@@ -10889,7 +10889,7 @@ static void disti_warm_hit(disti_warm *warm, int i, float s, float f, float erro
 static void disti_warm_newton(disti_warm *warm)
 {
     const disti_bench *bench = warm->bench;
-    float far = 0.03f * warm->tracer->field->radius, flat = -0.04f * warm->tracer->lipschitz;
+    float far = 0.03f * warm->tracer->field->radius, flat = -2e-3f * warm->tracer->lipschitz;
     for (int round = 0; round < 4 && warm->count > 0; round++) {
         size_t count = warm->count;
         for (size_t k = 0; k < count; k++) {
@@ -10906,7 +10906,7 @@ static void disti_warm_newton(disti_warm *warm)
             float slope = round == 0 ? ray->slope : (f - ray->fa) / (ray->q - ray->a), step = -f / slope;
             float length = step < 0.0f ? -step : step, moved = ray->q + step - warm->tape->s[disti_warm_pixel(warm, i)];
             int good = disti_finite(step) && slope < flat && length < far && moved < far && moved > -far &&
-                       (round == 0 || f * f < ray->fa * ray->fa) && ray->q + step > ray->start;
+                       (round == 0 || f * f < ray->fa * ray->fa) && ray->q + step > ray->enter;
             ray->fa = f;
             ray->slope = slope;
             ray->a = ray->q;
@@ -11055,7 +11055,8 @@ static int disti_warm_pass(const disti_warm *warm, disti_ray *ray, float f, floa
         float curvature = ray->fa - 2.0f * ray->f + f, rise = DISTI_MAX(ray->fa, f) - ray->f;
         float drop = curvature > 0.0f ? (ray->fa - f) * (ray->fa - f) / (8.0f * curvature) : 0.0f;
         float q = ray->s + disti_parabola(ray->width, ray->fa, ray->f, f);
-        if (ray->f - drop - 0.25f * rise > DISTI_MAX(least, ray->moved ? 0.0f : 0.5f * ray->f)) {
+        int convex = ray->f - rise > DISTI_MAX(0.5f * ray->f, 2.0f * warm->tracer->noise); /* above its chords, too */
+        if (convex || ray->f - drop - 0.25f * rise > DISTI_MAX(least, ray->moved ? 0.0f : 0.5f * ray->f)) {
             ray->s = q;
             ray->f -= drop;
             return 0;
@@ -11186,22 +11187,40 @@ static void disti_warm_drifts(disti_warm *warm)
     }
 }
 
+/* How much f may have fallen this turn at s of ray i: by what it did at the hits around that lie about as far away, and
+   a quarter more; without any, by the most that it changed in the tile. */
+static float disti_warm_loss(const disti_warm *warm, int i, float s)
+{
+    int width = warm->tile->width, x = i % width, y = i / width, known = 0;
+    float away = 0.05f * warm->tracer->field->radius, low = 0.0f;
+    for (int v = DISTI_MAX(y - 2, 0); v <= DISTI_MIN(y + 2, warm->tile->height - 1); v++) {
+        for (int u = DISTI_MAX(x - 2, 0); u <= DISTI_MIN(x + 2, width - 1); u++) {
+            int k = v * width + u;
+            float off = warm->bench->rays[k].best - s;
+            if (warm->moved[k] > 2e38f || off > away || off < -away) continue;
+            low = DISTI_MIN(low, -warm->moved[k] * warm->tape->value[disti_warm_pixel(warm, k)]);
+            known++;
+        }
+    }
+    return known > 1 ? DISTI_MIN(-1.25f * low + 0.1f * warm->change, warm->change) : warm->change;
+}
+
 /* The misses. Without a silhouette |f| is known not to be below tape->value less what has changed since; with one it is
    known by disti_warm_drifts. Where it may be near 0 it is asked for, and looked at on both sides. */
 static void disti_warm_misses(disti_warm *warm)
 {
     const disti_bench *bench = warm->bench;
     const dist_field *field = warm->tracer->field;
-    float loss = warm->change;
     int due = warm->silhouette && disti_warm_minima_due(warm, warm->mean);
     size_t count = 0, near = 0;
+    int slow = !warm->silhouette && warm->change < 5e-4f * field->radius;
     for (int i = 0; i < warm->n; i++) warm->drift[i] = 3e38f;
     if (warm->silhouette && !due) disti_warm_drifts(warm);
     for (int i = 0; i < warm->n; i++) {
         size_t pixel = disti_warm_pixel(warm, i);
         disti_ray *ray = &bench->rays[i];
         int blocked = ray->mode != DISTI_DONE, inside = warm->tape->status[pixel] & 15;
-        float sunk = warm->tape->value[pixel] + loss; /* f at the entry: below 0, the ray still starts inside */
+        float sunk = warm->tape->value[pixel] + warm->change; /* f at the entry: below 0, the ray still starts inside */
         if (inside == DIST_RAY_INSIDE && !warm->silhouette && blocked && !(ray->start > ray->enter) &&
             sunk < -warm->tracer->noise) {
             disti_ray_end(ray, DIST_RAY_INSIDE, ray->enter, sunk, 0.0f);
@@ -11210,11 +11229,12 @@ static void disti_warm_misses(disti_warm *warm)
         }
         if ((due && !blocked) || !disti_warm_misses_still(warm, i)) continue;
         float f = warm->tape->value[pixel], epsilon = disti_ray_epsilon(warm->tracer, ray, ray->start);
-        float lower = warm->silhouette && !due ? f + warm->drift[i] : f - loss;
+        float unsure = warm->silhouette ? 1.5f * warm->change : disti_warm_loss(warm, i, warm->tape->s[pixel]);
+        float lower = warm->silhouette && !due ? f + warm->drift[i] : f - unsure;
         ray->best = warm->tape->s[pixel];
         ray->moved = 0;
         if (lower > 2e38f) continue;
-        if (blocked && (due || lower < 1.5f * warm->change + 3.0f * epsilon)) {
+        if (blocked && (due || lower < unsure + 3.0f * epsilon)) {
             disti_ray_point(ray, ray->best, bench->points + 3 * count);
             bench->index[count++] = i;
         } else {
@@ -11233,13 +11253,18 @@ static void disti_warm_misses(disti_warm *warm)
         disti_ray *ray = &bench->rays[i];
         float f = bench->sdf[k], epsilon = disti_ray_epsilon(warm->tracer, ray, ray->best);
         float margin = 5.0f * (warm->change + epsilon); /* without a silhouette the bound is used up: a new one */
-        int bounded = warm->silhouette && warm->tape->value[disti_warm_pixel(warm, i)] > 0.0f;
+        float value = warm->tape->value[disti_warm_pixel(warm, i)];
+        int bounded = warm->silhouette && value > 0.0f;
         if (!bounded) margin += 0.03f * field->radius;
         ray->fbest = ray->f = f;
         ray->s = ray->best;
+        int odd = (i + i / warm->tile->width + (int)warm->tape->turn) & 1, still = slow && odd && value > 0.0f;
         if (f > margin) {
             disti_ray_end(ray, DIST_RAY_MISS, ray->best, warm->silhouette ? f : 0.5f * f, 0.0f);
             ray->kept = !due;
+        } else if (still && f > 3.0f * epsilon) {
+            disti_ray_end(ray, DIST_RAY_MISS, ray->best, f, 0.0f);
+            ray->kept = 1;
         } else if (f > 0.0f || warm->open[i]) {
             bench->index[near++] = i;
         }
@@ -11258,8 +11283,10 @@ static void disti_warm_beside(disti_warm *warm)
         disti_ray *ray = &bench->rays[i];
         float s = warm->tape->nearest[disti_warm_pixel(warm, i)];
         float *bound = &warm->tape->beside[disti_warm_pixel(warm, i)];
-        *bound = DISTI_MAX(*bound - warm->change, 0.0f);
-        if (*bound > 0.5f * warm->change + disti_ray_epsilon(warm->tracer, ray, s)) continue;
+        if (s > 2e38f) continue;
+        float loss = disti_warm_loss(warm, i, s);
+        *bound = DISTI_MAX(*bound - loss, 0.0f);
+        if (*bound > 0.5f * loss + disti_ray_epsilon(warm->tracer, ray, s)) continue;
         int hit = warm->moved[i] < 2e38f && s < ray->best, miss = ray->status == DIST_RAY_MISS && ray->kept;
         miss &= (i % warm->tile->width + i / warm->tile->width + (int)(warm->tape->turn & 1u)) & 1;
         if (!warm->open[i] || ray->mode != DISTI_DONE || !(hit || miss) || s <= ray->start || s >= ray->leave) continue;
@@ -11294,27 +11321,51 @@ static void disti_warm_beside(disti_warm *warm)
     disti_warm_near(warm, close);
 }
 
-/* Marches the hits whose turn it is. 0: one of them is nearer than expected. */
-static int disti_warm_refresh(disti_warm *warm)
+/* Ray i, which is done, marches, and is expected to end where it did. */
+static int disti_warm_expected(disti_warm *warm, int i)
+{
+    const disti_ray *ray = &warm->bench->rays[i];
+    float s = ray->status == DIST_RAY_HIT ? ray->best : ray->leave;
+    disti_warm_again(warm, i);
+    warm->moved[i] = s;
+    return i;
+}
+
+/* Marches the rays whose turn it is, then those around any that ends nearer than expected, and so on. */
+static void disti_warm_refresh(disti_warm *warm)
 {
     const disti_bench *bench = warm->bench;
     float far = 0.01f * warm->tracer->field->radius + 4.0f * warm->change;
+    int width = warm->tile->width, *list = (int *)(void *)(warm->open + 2 * DISTI_TILE * DISTI_TILE);
     size_t count = 0;
     for (int i = 0; i < warm->n; i++) {
         warm->moved[i] = 3e38f; /* from here on: where the ray was expected */
-        if (!disti_warm_due(warm, i, DISTI_WARM_HITS)) continue;
-        float s = warm->tape->s[disti_warm_pixel(warm, i)];
-        if (!disti_warm_expects(warm, i, s)) continue;
-        disti_warm_again(warm, i);
-        warm->moved[i] = s;
-        bench->index[count++] = i;
+        size_t pixel = disti_warm_pixel(warm, i);
+        int miss = (warm->tape->status[pixel] & 15) == DIST_RAY_MISS;
+        if (!warm->open[i] || !disti_warm_due(warm, i, miss ? DISTI_WARM_MISSES : DISTI_WARM_HITS)) continue;
+        if (!miss && !disti_warm_expects(warm, i, warm->tape->s[pixel])) continue;
+        list[count] = disti_warm_expected(warm, i);
+        if (!miss) warm->moved[i] = warm->tape->s[pixel];
+        count++;
     }
-    disti_trace_rounds(warm->tracer, warm->worker, bench, count, 0);
-    for (int i = 0; i < warm->n; i++)
-        if (warm->moved[i] < 2e38f && bench->rays[i].status == DIST_RAY_HIT &&
-            bench->rays[i].best < warm->moved[i] - far)
-            return 0;
-    return 1;
+    while (count > 0) {
+        size_t all = count;
+        memcpy(bench->index, list, count * sizeof(int));
+        disti_trace_rounds(warm->tracer, warm->worker, bench, count, 0);
+        count = 0;
+        memcpy(bench->index, list, all * sizeof(int));
+        for (size_t k = 0; k < all; k++) {
+            int at = bench->index[k], x = at % width;
+            if (bench->rays[at].status != DIST_RAY_HIT || !(bench->rays[at].best < warm->moved[at] - far)) continue;
+            for (int dy = -width; dy <= width; dy += width) {
+                for (int dx = -1; dx <= 1; dx++) {
+                    int i = at + dy + dx;
+                    if (x + dx < 0 || x + dx >= width || i < 0 || i >= warm->n || !bench->rays[i].kept) continue;
+                    list[count++] = disti_warm_expected(warm, i);
+                }
+            }
+        }
+    }
 }
 
 static void disti_render_warm(const disti_render_job *job, int worker, const disti_tile *tile, const disti_bench *bench)
@@ -11340,7 +11391,7 @@ static void disti_render_warm(const disti_render_job *job, int worker, const dis
     if (good) {
         disti_warm_misses(&warm);
         disti_warm_beside(&warm);
-        good = disti_warm_refresh(&warm);
+        disti_warm_refresh(&warm);
     }
     for (int i = 0; i < warm.n && !good; i++)
         if (warm.open[i]) disti_warm_again(&warm, i);

@@ -8342,6 +8342,15 @@ static int disti_ray_ask(disti_ray *ray, int mode, float q)
     return 1;
 }
 
+/* How far before a hit the surface may be for a ray that came down steeply, but crosses 0 slowly, by `falls`: between
+   the two f bends, and where it is as flat as that, ripples of the surface's |f| may have crossed 0 before. */
+static float disti_ray_kink(const disti_tracer *tracer, const disti_ray *ray, float falls)
+{
+    float flat = 6.0f * disti_ray_epsilon(tracer, ray, ray->a), most = 0.02f * tracer->field->radius;
+    if (!(falls < 0.12f * tracer->lipschitz && ray->incline < -4.0f * falls)) return 0.0f;
+    return flat < most * falls ? flat / falls : most;
+}
+
 /* Bracket [a, b], fa > 0 >= fb, finished by ITP (Oliveira and Takahashi 2020): regula falsi, pushed a little toward the
    middle and kept so near it that few more queries are needed than a bisection's. So slope, clamp and kinks cannot make
    it oscillate or crawl, and equal ends cannot divide by 0. */
@@ -8352,7 +8361,7 @@ static int disti_ray_bracket(const disti_tracer *tracer, disti_ray *ray)
     float q = ray->fa > ray->fb ? ray->a + width * (ray->fa / (ray->fa - ray->fb)) : middle; /* both may be 0 */
     if (width <= epsilon) {
         ray->slope = (ray->fb - ray->fa) / width;
-        return disti_ray_end(ray, DIST_RAY_HIT, q, 0.0f, width);
+        return disti_ray_end(ray, DIST_RAY_HIT, q, 0.0f, DISTI_MAX(width, disti_ray_kink(tracer, ray, -ray->slope)));
     }
     float room = epsilon; /* how far from the middle q may lie: what bisection would have left, less half the width */
     while (room < ray->width) room *= 2.0f;
@@ -8381,8 +8390,9 @@ static int disti_ray_bracketed(const disti_tracer *tracer, disti_ray *ray, float
     if (slope > 1e-3f && magnitude <= tolerance * DISTI_MIN(0.5f * slope, flatter)) {
         ray->slope = -slope;
         float width = ray->b - ray->a, off = magnitude + tracer->noise;
+        float error = disti_ray_kink(tracer, ray, flatter);
         return disti_ray_end(ray, DIST_RAY_HIT, ray->q + f / slope, 0.0f,
-                             off < width * flatter ? off / flatter : width);
+                             DISTI_MAX(error, off < width * flatter ? off / flatter : width));
     }
     if (inside) {
         ray->b = ray->q;
@@ -8401,6 +8411,7 @@ static int disti_ray_open_bracket(const disti_tracer *tracer, disti_ray *ray, fl
     ray->b = b;
     ray->fb = fb;
     ray->width = b - a;
+    ray->incline = (fb - fa) / (b - a);
     ray->side = 0;
     return disti_ray_bracket(tracer, ray);
 }
@@ -8492,9 +8503,11 @@ static int disti_ray_least(const disti_tracer *tracer, disti_ray *ray)
     int spent = ray->moved > 12 || ray->b - ray->a < 4e-6f * tracer->field->radius;
     float epsilon = disti_ray_epsilon(tracer, ray, ray->s);
     int flat = DISTI_MAX(ray->fa, ray->fb) - ray->f < tracer->noise;
-    int narrow = DISTI_MIN(left, right) > 0.3f * tracer->lipschitz || (!flat && ray->b - ray->a < epsilon);
+    float gentler = DISTI_MIN(left, right);
+    int narrow = gentler > 0.3f * tracer->lipschitz || (gentler > 0.0f && !flat && ray->b - ray->a < epsilon);
     int sheet = narrow && ray->f < 0.5f * epsilon; /* too thin to be sure of */
     if (spent || drop < ray->f) {
+        ray->slope = -left;
         if (sheet || (!flat && ray->f <= tracer->noise))
             return disti_ray_end(ray, DIST_RAY_HIT, ray->s, ray->f, ray->f / tracer->lipschitz + ray->b - ray->a);
         float s = ray->s, f = ray->f;
@@ -9913,11 +9926,12 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
     bench->balls = NULL;
 }
 
-/* What the neighbors say about the error bounds of hits, in the end. Behind a nearer neighbor, across a step in depth,
-   the nearer surface may go on in front of the hit, as the Lipschitz figure is an estimate: the bound reaches to there.
-   A predicted hit may be off by what it differs from the cubic through its neighbors, (-1, 4, 4, -1) / 6, or from their
-   mean if that is less: where the surface is smooth, next to nothing. Where f hardly falls at the hit it may have been
-   flat before, and have crossed 0 within the band's 4 epsilon: the bound reaches as far as that takes at this slope. */
+/* What the neighbors say about the error bounds of hits, in the end. Behind a nearer neighbor, across a step in depth
+   or in a dent, the nearer surface may go on in front of the hit, as the Lipschitz figure is an estimate: the bound
+   reaches to there. A predicted hit may be off by half as much again as it differs from the cubic through its
+   neighbors, (-1, 4, 4, -1) / 6, or from their mean if that is less: where the surface is smooth, next to nothing. At
+   a small step it lies between them. Where f hardly falls at the hit it may have been flat before, and have crossed 0
+   within the band's few epsilon: the bound reaches as far as that takes at this slope. */
 static void disti_trace_doubt(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench)
 {
     int n = tile->width * tile->height;
@@ -9928,8 +9942,8 @@ static void disti_trace_doubt(const disti_tracer *tracer, const disti_tile *tile
         float z = *depth, doubt = 0.0f;
         if (!(z > 0.0f)) continue;
         float falls = ray->slope < 0.0f ? -ray->slope : ray->slope, most = 0.02f * tracer->field->radius;
-        float flat = 4.0f * disti_ray_epsilon(tracer, ray, ray->best);
-        if (falls < 0.04f * tracer->lipschitz && ray->sign > 0.0f)
+        float flat = 6.0f * disti_ray_epsilon(tracer, ray, ray->best);
+        if (falls < 0.06f * tracer->lipschitz && ray->sign > 0.0f)
             ray->error = DISTI_MAX(ray->error, flat < most * falls ? flat / falls : most);
         for (int axis = 0; axis < 2; axis++) {
             int at = axis ? i / tile->width : i % tile->width, end = axis ? tile->height : tile->width;
@@ -9939,8 +9953,10 @@ static void disti_trace_doubt(const disti_tracer *tracer, const disti_tile *tile
             if (!(z1 > 0.0f && z2 > 0.0f)) continue;
             float fall1 = z - z1, fall2 = z - z2, pixel = 2.0f * ray->footprint * z;
             float size1 = fall1 < 0.0f ? -fall1 : fall1, size2 = fall2 < 0.0f ? -fall2 : fall2;
-            if (DISTI_MAX(size1, size2) > 2.0f * DISTI_MIN(size1, size2) + pixel) {
-                doubt = DISTI_MAX(doubt, size1 > size2 ? fall1 : fall2);
+            if (DISTI_MAX(size1, size2) > 2.0f * DISTI_MIN(size1, size2) + pixel ||
+                DISTI_MIN(fall1, fall2) > 2.0f * pixel) {
+                float fall = size1 > size2 ? fall1 : fall2;
+                doubt = DISTI_MAX(doubt, ray->off > 0.0f && fall < 0.0f && -fall < most ? -fall : fall);
                 continue;
             }
             float a = disti_depth_beside(depth, at, end, -2, stride), b = disti_depth_beside(depth, at, end, 2, stride);
@@ -9948,7 +9964,7 @@ static void disti_trace_doubt(const disti_tracer *tracer, const disti_tile *tile
             if (!(ray->off > 0.0f)) continue;
             if (a > 0.0f && b > 0.0f) cubic = (4.0f * (fall1 + fall2) + a + b - z - z) / 6.0f;
             off = DISTI_MIN(off < 0.0f ? -off : off, cubic < 0.0f ? -cubic : cubic);
-            doubt = DISTI_MAX(doubt, off);
+            doubt = DISTI_MAX(doubt, 1.5f * off);
         }
         ray->error = DISTI_MAX(ray->error, doubt / ray->cosine);
     }
@@ -10913,7 +10929,7 @@ static void disti_warm_newton(disti_warm *warm)
             ray->q += step;
             int steep = slope < -0.3f * warm->tracer->lipschitz;
             if (good && length <= (round > 0 ? 12.0f : steep ? 8.0f : 4.0f) * epsilon) {
-                disti_warm_hit(warm, i, ray->q, f, 2.0f * length);
+                disti_warm_hit(warm, i, ray->q, f, 2.0f * length - warm->tracer->noise / slope);
                 disti_warm_change(warm, moved * slope);
             } else if (good && round < 3) {
                 bench->index[warm->count++] = i;
@@ -10925,9 +10941,16 @@ static void disti_warm_newton(disti_warm *warm)
     warm->count = 0;
 }
 
+/* Where f changes alike, hits move by that over their slopes: how much more i moves than k. Else (`slopes` 0) alike. */
+static float disti_warm_slower(const disti_warm *warm, int slopes, int i, int k)
+{
+    const float *slope = warm->tape->value;
+    return slopes ? slope[disti_warm_pixel(warm, k)] / slope[disti_warm_pixel(warm, i)] : 1.0f;
+}
+
 /* Interpolated from the corners of the pixel's 8 x 8 block, as far as they are known; *spread gets how much all four
    differ, 3e38 if one is not known. */
-static float disti_warm_guess(const disti_warm *warm, const float *moved, int i, float *spread)
+static float disti_warm_guess(const disti_warm *warm, const float *moved, int slopes, int i, float *spread)
 {
     int width = warm->tile->width, height = warm->tile->height, x = i % width, y = i / width, known = 0;
     float sum = 0.0f, weights = 0.0f, low = 3e38f, high = -3e38f;
@@ -10935,7 +10958,7 @@ static float disti_warm_guess(const disti_warm *warm, const float *moved, int i,
         int right = k & 1, down = k >> 1, cx = (x & ~7) + 8 * right, cy = (y & ~7) + 8 * down;
         if (cx >= width || cy >= height || moved[cy * width + cx] > 2e38f) continue;
         float weight = (float)((right ? x & 7 : 8 - (x & 7)) * (down ? y & 7 : 8 - (y & 7)));
-        float move = moved[cy * width + cx];
+        float move = moved[cy * width + cx] * disti_warm_slower(warm, slopes, i, cy * width + cx);
         sum += weight * move;
         weights += weight;
         low = DISTI_MIN(low, move);
@@ -10955,7 +10978,7 @@ static int disti_warm_asks(const disti_warm *warm, int x, int y)
 
 /* Mean of the moves of the pixels around that were asked, two beside it or four at its corners; *spread gets how much
    they differ, 3e38 if too few are known. */
-static float disti_warm_between(const disti_warm *warm, const float *moves, int i, float *spread)
+static float disti_warm_between(const disti_warm *warm, const float *moves, int slopes, int i, float *spread)
 {
     int width = warm->tile->width, height = warm->tile->height, x = i % width, y = i / width, known = 0, all = 0,
         border = 0;
@@ -10970,6 +10993,7 @@ static float disti_warm_between(const disti_warm *warm, const float *moves, int 
             }
             float moved = moves[i + dy * width + dx];
             if (moved > 2e38f) continue;
+            moved *= disti_warm_slower(warm, slopes, i, i + dy * width + dx);
             known++;
             low = DISTI_MIN(low, moved);
             high = DISTI_MAX(high, moved);
@@ -10977,7 +11001,7 @@ static float disti_warm_between(const disti_warm *warm, const float *moves, int 
         }
     }
     float mean = known > 0 ? sum / (float)known : 3e38f, guess = 3e38f;
-    if (border) guess = disti_warm_guess(warm, moves, i, spread);
+    if (border) guess = disti_warm_guess(warm, moves, slopes, i, spread);
     if (known > 0 && guess < 2e38f) {
         low = DISTI_MIN(low, guess);
         high = DISTI_MAX(high, guess);
@@ -10986,19 +11010,30 @@ static float disti_warm_between(const disti_warm *warm, const float *moves, int 
     return mean;
 }
 
-/* The hits: every 8th, the quarter that is asked, the others. 0: much has moved. */
+/* The hits: every 8th, the quarter that is asked, the others, which have moved as those around have, or as f changed
+   there over their own slope. 0: much has moved. */
 static int disti_warm_hits(disti_warm *warm)
 {
     size_t tried = 0, good = 0;
-    float sum = 0.0f;
+    float sum = 0.0f, mean = 0.0f; /* of how f changed */
     for (int pass = 0; pass < 3; pass++) {
         for (int i = 0; i < warm->n; i++) {
             int x = i % warm->tile->width, y = i / warm->tile->width;
             if (pass == 0 ? (x | y) & 7 : disti_warm_asks(warm, x, y) == (pass == 2)) continue;
             size_t pixel = disti_warm_pixel(warm, i);
-            float spread = 3e38f, wide = 3e38f, s = warm->tape->s[pixel];
-            float move = pass == 2 ? disti_warm_between(warm, warm->moved, i, &spread) : 0.0f;
-            if (pass > 0 && spread > 2e38f) move = disti_warm_guess(warm, warm->moved, i, &wide);
+            float spread = 3e38f, wide = 3e38f, s = warm->tape->s[pixel], move = 0.0f;
+            if (!(warm->tape->value[pixel] < -0.04f * warm->tracer->lipschitz)) continue; /* as disti_warm_expects */
+            for (int slopes = 0; slopes < 2 && pass > 0; slopes++) { /* the one by which the neighbors differ less */
+                float apart = 3e38f, *least = &spread, other = 3e38f;
+                if (pass == 2) other = disti_warm_between(warm, warm->moved, slopes, i, &apart);
+                if (apart > 2e38f && spread > 2e38f) {
+                    other = disti_warm_guess(warm, warm->moved, slopes, i, &apart);
+                    least = &wide;
+                }
+                if (slopes && !(apart < *least)) continue;
+                move = other;
+                *least = apart;
+            }
             if (move > 2e38f) move = 0.0f;
             if (!disti_warm_expects(warm, i, s + move) || disti_warm_due(warm, i, DISTI_WARM_HITS)) continue;
             disti_ray *ray = &warm->bench->rays[i];
@@ -11007,7 +11042,8 @@ static int disti_warm_hits(disti_warm *warm)
             ray->q = s + move;
             unsigned other = ((unsigned)(x / 2 + y / 2) + warm->tape->turn / 4u) & 3u;
             if (pass == 1 && wide <= epsilon && other != 0) spread = wide;
-            if (spread <= 5.0f * epsilon) disti_warm_hit(warm, i, ray->q, 0.0f, 8.0f * epsilon + 2.0f * spread);
+            float error = 8.0f * epsilon + 2.0f * spread - 3.0f * mean / ray->slope; /* amid others at a crease */
+            if (spread <= 5.0f * epsilon) disti_warm_hit(warm, i, ray->q, 0.0f, error);
             else warm->bench->index[warm->count++] = i;
         }
         if (pass == 0) tried = warm->count;
@@ -11018,6 +11054,7 @@ static int disti_warm_hits(disti_warm *warm)
             sum += change < 0.0f ? -change : change;
             good++;
         }
+        mean = good > 0 ? sum / (float)good : 0.0f;
         if (4 * good < 3 * tried || sum > 8e-3f * warm->tracer->field->radius * (float)good) return 0;
     }
     return 1;
@@ -11170,7 +11207,7 @@ static void disti_warm_drifts(disti_warm *warm)
             if (h == 8 && f > clamp && ((unsigned)((x ^ y) / 8) + warm->tape->turn) % 4u != 0) drift = 0.0f;
             if (h < 8 && f > far) drift = disti_warm_drift(warm, i, 8, f);
             if (h < 4 && f > 0.4f * far && drift > 2e38f) drift = disti_warm_drift(warm, i, 4, f);
-            if (h == 1 && drift > 2e38f) drift = disti_warm_between(warm, warm->drift, i, &spread);
+            if (h == 1 && drift > 2e38f) drift = disti_warm_between(warm, warm->drift, 0, i, &spread);
             if (spread < 2e38f && !(spread < DISTI_MAX(0.25f * warm->change, 3e-3f * f))) drift = 3e38f;
             warm->drift[i] = drift;
             if (drift < 2e38f) continue;

@@ -1211,9 +1211,9 @@ static inline void print_report(dist_context *ctx, const dist_field *field, cons
                                 const dist_render_desc *how, const dist_images *picture, double seconds, size_t bytes)
 {
     static const char *const names[2][14] = {
-        {"hits", "unresolved", "bound, mean", "bound, p99", "bound, largest", "true error, mean", "true error, p99",
-         "true error, largest", "share within bound", "holes", "false hits", "truth: unresolved", "truth: queries",
-         "slope reckoned with"},
+        {"hits", "unresolved", "bound, median", "bound, p99", "bound, largest", "true error, median",
+         "true error, p99", "true error, largest", "share within bound", "holes", "false hits", "truth: unresolved",
+         "truth: queries", "slope reckoned with"},
         {"queries", "  cones", "  march", "  refine", "  silhouette", "  normals", "  colors", "queries a pixel",
          "queries a hit", "multiply-adds asked", "multiply-adds done", "seconds", "bytes of memory", "slope of the truth"}};
     size_t n = (size_t)camera->width * (size_t)camera->height;

@@ -29,7 +29,8 @@ reports() {
                     v[name] = number + 0; rows++ } }
         END { if (rows < 26 || !(v["hits"] > 0) || !(v["bytes of memory"] > 0) || !(v["truth: queries"] > 0)) bad = 1
               if (v["share within bound"] < 0.9 || v["share within bound"] > 1) bad = 1
-              if (v["bound, mean"] > v["bound, largest"] || v["true error, mean"] > v["true error, largest"]) bad = 1
+              if (v["bound, median"] > v["bound, p99"] || v["bound, p99"] > v["bound, largest"]) bad = 1
+              if (v["true error, median"] > v["true error, p99"] || v["true error, p99"] > v["true error, largest"]) bad = 1
               sum = v["cones"] + v["march"] + v["refine"] + v["silhouette"] + v["normals"] + v["colors"]
               if (sum != v["queries"] || v["multiply-adds done"] > v["multiply-adds asked"]) bad = 1
               exit bad }' "$work/rows"

@@ -21,10 +21,10 @@
    Gradients are those of sum of |n . v| depth over the pixels that should be hit, for the code and for the camera
    (rotation and translation), against the exact ones: the implicit function theorem at the reference's points, all in
    double, a network's derivatives too. norm_error: |g - exact| / |exact|. gradient_queries: those of the
-   picture with a tape and the points of its adjoint. Warm pictures start from that of a code one part in 2000 away.
-   guarded_dense leaves no dead unit out where only values are asked for. guarded_f16 and _bf16 take field.coarse_fn for
-   everything (dist_net_set_half): the bound is then one of the field in 16 bits and knows nothing of its rounding.
-   Where the processor has none of it the row says "not available".
+   picture with a tape and the points of its adjoint; gradient_seconds: of both, one run. Warm pictures start from that
+   of a code one part in 2000 away. guarded_dense leaves no dead unit out where only values are asked for. guarded_f16
+   and _bf16 take field.coarse_fn for everything (dist_net_set_half): the bound is then one of the field in 16 bits and
+   knows nothing of its rounding. Where the processor has none of it the row says "not available".
 
    --minutes bounds what a case's size takes beside its reference: the rows come in order of importance, defaults first.
    One is made with fewer runs (column `runs`) if 7 would take more than an eighth of the time, and is left out, with a
@@ -124,7 +124,7 @@ static const method methods[] = {
 };
 
 enum { SCENES = sizeof scenes / sizeof scenes[0], METHODS = sizeof methods / sizeof methods[0], MOST_ROWS = 32768 };
-#define EMPTY ",,,,,,,,,,,,,,,,,,,,,,,,,,," /* the rest of a row */
+#define EMPTY ",,,,,,,,,,,,,,,,,,,,,,,,,,,," /* the rest of a row */
 
 /* ---- fields ------------------------------------------------------------------------------------------------------ */
 
@@ -524,7 +524,7 @@ typedef struct row {
     int size, runs;
     double queries, operations, seconds, fastest, slowest, silhouette_queries, silhouette_seconds;
     double mean, p99, largest, normal, silhouette, near, violations, touched;
-    double gradient_queries, code_cosine, code_error, camera_cosine, camera_error; /* errors < 0: there is none */
+    double gradient_queries, gradient_seconds, code_cosine, code_error, camera_cosine, camera_error; /* errors < 0: there is none */
     size_t compared, hits, holes, false_hits, unresolved, true_hits;
 } row;
 
@@ -686,8 +686,10 @@ static void gradient(const subject *j, const dist_render_desc *how, row *r)
     grads.rotation = camera;
     grads.translation = camera + 3;
     grads.code = j->code_size ? take_floats(j->code_size) : NULL;
+    double start = seconds_now();
     dist_render(j->ctx, j->field, j->camera, &cold, &out, tape);
     dist_render_backward(j->ctx, tape, &d_out, &grads);
+    r->gradient_seconds = seconds_now() - start;
     check(j->ctx);
     r->gradient_queries = (double)(stats.queries + stats.backward_points);
     judge_gradient(6, camera, j->exact, &r->camera_cosine, &r->camera_error);
@@ -795,7 +797,7 @@ static void print_row(const row *r)
            r->near, r->gradient_queries);
     if (r->code_error >= 0) { printf("%.8f,%.3e,", r->code_cosine, r->code_error); } else { printf(",,"); }
     if (r->camera_error >= 0) { printf("%.8f,%.3e,", r->camera_cosine, r->camera_error); } else { printf(",,"); }
-    printf("%.0f\n", (double)r->compared);
+    printf("%.0f,%.5f\n", (double)r->compared, r->gradient_seconds);
     fflush(stdout);
 }
 
@@ -832,6 +834,8 @@ static const panel_of panels[] = {
     {"distance, 99 % of the hits", Y_P99, OVER_SECONDS, 1e-8},
     {"holes and false hits per pixel to hit", Y_WRONG, OVER_SECONDS, 1e-5},
     {"silhouette near the outline, mean", Y_NEAR, OVER_SECONDS, 1e-8},
+    {"gradient for the camera, relative", Y_CAMERA, OVER_SECONDS, 1e-7},
+    {"gradient for the code, relative", Y_CODE, OVER_SECONDS, 1e-7},
     {"distance, 99 % of the hits", Y_P99, OVER_OPERATIONS, 1e-8},
 };
 enum { PANELS = sizeof panels / sizeof panels[0] };
@@ -839,6 +843,7 @@ enum { PANELS = sizeof panels / sizeof panels[0] };
 static double plot_x(const row *r, const panel_of *v)
 {
     double pixels = (double)r->size * (double)r->size;
+    if (v->over == OVER_SECONDS && v->y >= Y_CODE) { return r->gradient_seconds; }
     if (v->over == OVER_SECONDS) { return v->y == Y_NEAR ? r->silhouette_seconds : r->seconds; }
     if (v->over == OVER_OPERATIONS) { return r->operations / pixels; }
     if (v->y >= Y_CODE) { return r->gradient_queries / pixels; }
@@ -913,7 +918,7 @@ static void plot_rows(const char *stem, const row *rows, size_t n)
             if (first) { continue; }
             plot_point *q = plot_add(s, plot_x(r, v), plot_y(r, v));
             q->open = failed(r);
-            if (v->over == OVER_SECONDS && v->y != Y_NEAR) { q->x_low = r->fastest, q->x_high = r->slowest; }
+            if (v->over == OVER_SECONDS && v->y < Y_NEAR) { q->x_low = r->fastest, q->x_high = r->slowest; }
         }
         for (size_t i = 0; i < n; i++) {
             const row *r = rows + i;
@@ -1243,7 +1248,7 @@ int main(int argc, char **argv)
          "p99_error,max_error,holes,false_hits,normal_p99_degrees,silhouette_mean_error,bound_violations_per_mille,"
          "runs,seconds_min,seconds_max,hits,unresolved,touched_per_mille,queries_with_silhouette,"
          "seconds_with_silhouette,silhouette_near_mean_error,gradient_queries,code_cosine,code_norm_error,"
-         "camera_cosine,camera_norm_error,pixels_compared");
+         "camera_cosine,camera_norm_error,pixels_compared,gradient_seconds");
     for (int i = 0; i < SCENES; i++) {
         const scene *s = &scenes[i];
         int wanted = only ? strcmp(only, s->name) == 0 : w.quick ? s->quick : slow || !s->slow;

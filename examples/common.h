@@ -1179,14 +1179,13 @@ static inline int compare_floats(const void *a, const void *b)
     return (x > y) - (x < y);
 }
 
-/* Mean, 99th percentile (nearest rank) and largest of n values, which are sorted; -1 of none. */
+/* Median and 99th percentile (nearest rank) and largest of n values, which are sorted; -1 of none. */
 static inline void spread_of(size_t n, float *values, double spread[3])
 {
     spread[0] = spread[1] = spread[2] = -1;
     if (n == 0) { return; }
     qsort(values, n, sizeof *values, compare_floats);
-    spread[0] = 0;
-    for (size_t i = 0; i < n; i++) spread[0] += (double)values[i] / (double)n;
+    spread[0] = (double)values[(n + 1) / 2 - 1];
     spread[1] = (double)values[(n * 99 + 99) / 100 - 1];
     spread[2] = (double)values[n - 1];
 }

@@ -1263,9 +1263,7 @@ static void disti_job_task(void *arg, int index, int worker)
 /* The only door to parallelism: fn(arg, index, worker) for index 0..count-1, worker below ctx->workers. */
 static void disti_run(dist_context *ctx, int count, dist_task_fn fn, void *arg)
 {
-    disti_job job;
-    job.fn = fn;
-    job.arg = arg;
+    disti_job job = {fn, arg};
     if (ctx->scheduler.run_fn) {
         ctx->scheduler.run_fn(ctx->scheduler.user, count, disti_job_task, &job);
         return;
@@ -1306,9 +1304,8 @@ static int disti_default_workers(void)
 }
 
 /* At the door of every public function that takes a context. A context that could not be made refuses everything. */
-static dist_status disti_enter(const dist_context *ctx, const char *function)
+static dist_status disti_enter(const dist_context *ctx)
 {
-    (void)function;
     if (!ctx) return DIST_BAD_ARGUMENT;
     return ctx->workers > 0 ? DIST_OK : ctx->status;
 }
@@ -3200,20 +3197,15 @@ static void disti_eval_task(void *arg, int index, int worker)
 static void disti_field_eval_all(dist_context *ctx, const dist_field *field, size_t n, const float *points, float *sdf,
                                  float *gradient)
 {
-    disti_eval_job job;
     if (n == 0) return;
-    job.field = field;
-    job.pieces = disti_cut(n, 8 * DISTI_BLOCK, 1u << 20);
-    job.points = points;
-    job.sdf = sdf;
-    job.gradient = gradient;
+    disti_eval_job job = {field, disti_cut(n, 8 * DISTI_BLOCK, 1u << 20), points, sdf, gradient};
     disti_run(ctx, job.pieces.count, disti_eval_task, &job);
 }
 
 DIST_API dist_status dist_field_eval(dist_context *ctx, const dist_field *field, size_t n, const float *points,
                                      float *sdf, float *gradient)
 {
-    dist_status status = disti_enter(ctx, "dist_field_eval");
+    dist_status status = disti_enter(ctx);
     if (status == DIST_OK) status = disti_field_check(ctx, field, "dist_field_eval");
     if (status != DIST_OK || n == 0) return status;
     if (!points || !sdf)
@@ -3267,17 +3259,12 @@ static dist_status disti_color_check(dist_context *ctx, const dist_field *field,
 DIST_API dist_status dist_color_eval(dist_context *ctx, const dist_field *field, size_t n, const float *points,
                                      float *color)
 {
-    disti_color_job job;
-    dist_status status = disti_enter(ctx, "dist_color_eval");
+    dist_status status = disti_enter(ctx);
     if (status == DIST_OK) status = disti_color_check(ctx, field, 0, "dist_color_eval");
     if (status != DIST_OK || n == 0) return status;
     if (!points || !color)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_color_eval: %s is NULL", points ? "color" : "points", 0, 0);
-    memset(&job, 0, sizeof job);
-    job.field = field;
-    job.pieces = disti_cut(n, 8 * DISTI_BLOCK, 1u << 20);
-    job.points = points;
-    job.color = color;
+    disti_color_job job = {field, disti_cut(n, 8 * DISTI_BLOCK, 1u << 20), points, NULL, color, NULL, NULL, 0, 0};
     disti_run(ctx, job.pieces.count, disti_color_task, &job);
     return DIST_OK;
 }
@@ -3312,7 +3299,6 @@ static float *disti_color_weights(const dist_field *field, const dist_gradients 
 static void disti_color_backward_all(dist_context *ctx, const dist_field *field, size_t n, const float *points,
                                      const float *d_color, float *d_points, const dist_gradients *grads, double *total)
 {
-    disti_color_job job;
     size_t size = (size_t)field->code_size + (size_t)field->color_code_size;
     float *weights = disti_color_weights(field, grads);
     int codes = grads->code || grads->color_code;
@@ -3321,15 +3307,8 @@ static void disti_color_backward_all(dist_context *ctx, const dist_field *field,
         field->color_weights_fn(field->user, ctx, n, points, d_color, d_points, codes ? total : NULL, weights);
         return;
     }
-    memset(&job, 0, sizeof job);
-    job.field = field;
-    job.pieces = disti_cut(n, DISTI_BLOCK, DISTI_SLOTS);
-    job.points = points;
-    job.d_color = d_color;
-    job.d_points = d_points;
-    job.slots = ctx->partial;
-    job.code = grads->code != NULL;
-    job.color_code = grads->color_code != NULL;
+    disti_color_job job = {field, disti_cut(n, DISTI_BLOCK, DISTI_SLOTS), points, d_color, NULL, d_points,
+                           ctx->partial, grads->code != NULL, grads->color_code != NULL};
     memset(ctx->partial, 0, (size_t)job.pieces.count * size * sizeof(double));
     disti_run(ctx, job.pieces.count, disti_color_task, &job);
     for (size_t i = 0; codes && i < (size_t)job.pieces.count * size; i++) total[i % size] += ctx->partial[i];
@@ -3338,7 +3317,6 @@ static void disti_color_backward_all(dist_context *ctx, const dist_field *field,
 /* One slot's share of dist_field_backward; d_code holds the slot's own sums. */
 typedef struct disti_backward_job {
     const dist_field *field;
-    disti_pieces pieces;
     const float *points;
     const float *directions; /* not NULL: second_fn's */
     float *d_sdf;
@@ -3346,6 +3324,7 @@ typedef struct disti_backward_job {
     void *seed_user;
     float *d_points;
     double *d_code; /* (pieces.count, code_size) or NULL */
+    disti_pieces pieces;
 } disti_backward_job;
 
 /* The part of a piece that a seed call is about. */
@@ -3405,14 +3384,7 @@ static void disti_field_backward_all(dist_context *ctx, const dist_field *field,
                                      float *d_sdf, dist_seed_fn seed_fn, void *seed_user, float *d_points,
                                      double *d_code)
 {
-    disti_backward_job job;
-    memset(&job, 0, sizeof job);
-    job.field = field;
-    job.points = points;
-    job.d_sdf = d_sdf;
-    job.seed_fn = seed_fn;
-    job.seed_user = seed_user;
-    job.d_points = d_points;
+    disti_backward_job job = {field, points, NULL, d_sdf, seed_fn, seed_user, d_points, NULL, {0, 0, 0}};
     disti_backward_run(ctx, &job, n, d_code);
 }
 
@@ -3436,12 +3408,7 @@ static dist_status disti_field_second(dist_context *ctx, const dist_field *field
     if (stencil == 0 && d_weights)
         return field->second_weights_fn(field->user, ctx, n, points, directions, d_points, d_code, d_weights);
     if (stencil == 0) {
-        disti_backward_job job;
-        memset(&job, 0, sizeof job);
-        job.field = field;
-        job.points = points;
-        job.directions = directions;
-        job.d_points = d_points;
+        disti_backward_job job = {field, points, directions, NULL, NULL, NULL, d_points, NULL, {0, 0, 0}};
         disti_backward_run(ctx, &job, n, d_code);
         return status;
     }
@@ -3493,7 +3460,7 @@ DIST_API dist_status dist_color_backward(dist_context *ctx, const dist_field *fi
 {
     const char *name = "dist_color_backward";
     dist_gradients mine;
-    dist_status status = disti_enter(ctx, name);
+    dist_status status = disti_enter(ctx);
     if (status == DIST_OK) status = disti_color_check(ctx, field, 1, name);
     if (status == DIST_OK && !grads) status = disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: grads is NULL", name, 0, 0);
     if (status != DIST_OK) return status;
@@ -3544,7 +3511,7 @@ DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *fi
                                          const dist_gradients *grads)
 {
     const char *name = "dist_field_backward";
-    dist_status status = disti_enter(ctx, name);
+    dist_status status = disti_enter(ctx);
     if (status == DIST_OK) status = disti_field_check(ctx, field, name);
     if (status == DIST_OK) status = disti_gradients_check(ctx, field, grads, name);
     if (status != DIST_OK || n == 0) return status;
@@ -3574,7 +3541,7 @@ DIST_API dist_status dist_field_eikonal(dist_context *ctx, const dist_field *fie
 {
     const char *name = "dist_field_eikonal";
     double *d_code = NULL, sum = 0.0;
-    dist_status status = disti_enter(ctx, name);
+    dist_status status = disti_enter(ctx);
     if (loss) *loss = 0.0f;
     if (status == DIST_OK) status = disti_field_check(ctx, field, name);
     if (status == DIST_OK && grads) status = disti_gradients_check(ctx, field, grads, name);
@@ -3880,6 +3847,19 @@ typedef struct disti_scene_link {
     double *d_code;
 } disti_scene_link;
 
+/* What a pull g = dL/dp on a point, and `own` on log s besides, add to a placement's seven numbers. */
+static void disti_placed_pull(const disti_placed *placed, const float *p, const double g[3], double own, double *d)
+{
+    double r[3], torque[3];
+    for (int k = 0; k < 3; k++) r[k] = (double)p[k] - (double)placed->translation[k];
+    disti_cross(g, r, torque);
+    d[0] += own - disti_dot(g, r);
+    for (int k = 0; k < 3; k++) {
+        d[1 + k] += torque[k];
+        d[4 + k] -= g[k];
+    }
+}
+
 /* Point i of the chunk is finished: value and gradient out, the seed in, the placement's share added. Returns the
    seed. */
 static float disti_scene_emit(const disti_scene_link *link, size_t i, int instance, float value, const float *gradient)
@@ -3892,17 +3872,9 @@ static float disti_scene_emit(const disti_scene_link *link, size_t i, int instan
     if (!link->seed_fn) return 0.0f;
     link->seed_fn(link->seed_user, link->at + i, 1, &value, gradient, &seed);
     if (!link->d_code || seed == 0.0f) return seed;
-    double g[3], r[3], torque[3], *d = link->d_code + placed->offset + placed->code;
-    for (int k = 0; k < 3; k++) {
-        g[k] = (double)seed * (double)gradient[k];
-        r[k] = (double)p[k] - (double)placed->translation[k];
-    }
-    disti_cross(g, r, torque);
-    d[0] += (double)seed * (double)value - disti_dot(g, r);
-    for (int k = 0; k < 3; k++) {
-        d[1 + k] += torque[k];
-        d[4 + k] -= g[k];
-    }
+    double g[3];
+    for (int k = 0; k < 3; k++) g[k] = (double)seed * (double)gradient[k];
+    disti_placed_pull(placed, p, g, (double)seed * (double)value, link->d_code + placed->offset + placed->code);
     return seed;
 }
 
@@ -3944,12 +3916,7 @@ static void disti_scene_fused(void *user, int worker, size_t n, const float *poi
     const dist_scene *scene = (const dist_scene *)user;
     disti_scene_work w;
     disti_scene_layout(scene, scene->scratch + scene->scratch_bytes * (size_t)worker, &w);
-    disti_scene_link link;
-    link.scene = scene;
-    link.work = &w;
-    link.seed_fn = seed_fn;
-    link.seed_user = seed_user;
-    link.d_code = d_code;
+    disti_scene_link link = {scene, &w, NULL, 0, 0, NULL, NULL, seed_fn, seed_user, d_code};
     for (size_t at = 0; at < n; at += DISTI_SCENE_CHUNK) {
         size_t count = DISTI_MIN(n - at, (size_t)DISTI_SCENE_CHUNK);
         int plain = !gradient && !seed_fn;
@@ -4004,19 +3971,14 @@ static void disti_scene_unpaint(const disti_placed *placed, int worker, const di
                                 ? pull->d_color_code + placed->color_offset : NULL);
     for (size_t i = 0; i < count; i++) {
         size_t at = 3 * (size_t)w->order[j + i];
-        double g[3], r[3], torque[3], *d = pull->d_code ? pull->d_code + placed->offset + placed->code : NULL;
+        double g[3];
         for (size_t k = 0; k < 3; k++) {
             const float *row = placed->rotation + 3 * k;
             g[k] = (double)(row[0] * y[3 * i] + row[1] * y[3 * i + 1] + row[2] * y[3 * i + 2]) / (double)placed->scale;
-            r[k] = (double)points[at + k] - (double)placed->translation[k];
             if (pull->d_points) pull->d_points[at + k] += (float)g[k];
         }
-        disti_cross(g, r, torque);
-        if (d) d[0] -= disti_dot(g, r);
-        for (int k = 0; d && k < 3; k++) {
-            d[1 + k] += torque[k];
-            d[4 + k] -= g[k];
-        }
+        if (pull->d_code)
+            disti_placed_pull(placed, points + at, g, 0.0, pull->d_code + placed->offset + placed->code);
     }
 }
 
@@ -4028,8 +3990,7 @@ static void disti_scene_paint(const dist_scene *scene, int worker, size_t n, con
     disti_scene_layout(scene, scene->scratch + scene->scratch_bytes * (size_t)worker, &w);
     for (size_t at = 0; at < n; at += DISTI_SCENE_CHUNK) {
         size_t count = DISTI_MIN(n - at, (size_t)DISTI_SCENE_CHUNK);
-        disti_scene_pull pull;
-        memset(&pull, 0, sizeof pull);
+        disti_scene_pull pull = {NULL, NULL, NULL, NULL};
         if (back) {
             pull = *back;
             pull.d_color += 3 * at;
@@ -4064,11 +4025,7 @@ static void disti_scene_color(void *user, int worker, size_t n, const float *poi
 static void disti_scene_color_adjoint(void *user, int worker, size_t n, const float *points, const float *d_color,
                                       float *d_points, double *d_code, double *d_color_code)
 {
-    disti_scene_pull pull;
-    pull.d_color = d_color;
-    pull.d_points = d_points;
-    pull.d_code = d_code;
-    pull.d_color_code = d_color_code;
+    disti_scene_pull pull = {d_color, d_points, d_code, d_color_code};
     disti_scene_paint((const dist_scene *)user, worker, n, points, NULL, &pull);
 }
 
@@ -4188,7 +4145,7 @@ static dist_status disti_scene_take(dist_scene *scene)
 DIST_API dist_scene *dist_scene_create(dist_context *ctx, int count, const dist_instance *instances)
 {
     const char *name = "dist_scene_create";
-    if (disti_enter(ctx, name) != DIST_OK) return NULL;
+    if (disti_enter(ctx) != DIST_OK) return NULL;
     if (count < 1 || count > 1 << 20 || !instances) {
         disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: count is %d, must be 1 to 2^20; instances not NULL", name, count, 0);
         return NULL;
@@ -4318,16 +4275,12 @@ static void disti_scene_find_task(void *arg, int index, int worker)
 
 DIST_API dist_status dist_scene_find(dist_scene *scene, size_t n, const float *points, int *index)
 {
-    disti_scene_job job;
     if (!scene) return DIST_BAD_ARGUMENT;
     if (n == 0) return DIST_OK;
     if (!points || !index)
         return disti_fail(scene->ctx, DIST_BAD_ARGUMENT, "dist_scene_find: %s is NULL", points ? "index" : "points", 0,
                           0);
-    job.scene = scene;
-    job.pieces = disti_cut(n, DISTI_SCENE_CHUNK, 1u << 20);
-    job.points = points;
-    job.index = index;
+    disti_scene_job job = {scene, disti_cut(n, DISTI_SCENE_CHUNK, 1u << 20), points, index};
     disti_run(scene->ctx, job.pieces.count, disti_scene_find_task, &job);
     return DIST_OK;
 }
@@ -5124,9 +5077,7 @@ static dist_status disti_archive_write(dist_context *ctx, const char *function, 
                                        const disti_tensor_out *tensors, size_t meta_count, const char *const *keys,
                                        const char *const *values, void *buffer, size_t capacity, size_t *size)
 {
-    disti_writer w;
-    w.out = NULL;
-    w.size = 8;
+    disti_writer w = {NULL, 8};
     *size = 0;
     size_t data = disti_put_header(&w, tensor_count, tensors, meta_count, keys, values), total;
     if (w.size > DISTI_HEADER_MAX)
@@ -6973,7 +6924,7 @@ static dist_status disti_shape_take(dist_shape *shape)
 
 DIST_API dist_shape *dist_shape_create(dist_context *ctx, const dist_net *net, const float *code)
 {
-    if (disti_enter(ctx, "dist_shape_create") != DIST_OK) return NULL;
+    if (disti_enter(ctx) != DIST_OK) return NULL;
     if (!net) {
         disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_shape_create: net is NULL", NULL, 0, 0);
         return NULL;
@@ -7015,7 +6966,7 @@ DIST_API dist_status dist_shape_set_texture(dist_shape *shape, const dist_net *t
     if (!shape) return DIST_BAD_ARGUMENT;
     dist_context *ctx = shape->ctx;
     dist_shape *paint = NULL;
-    dist_status status = disti_enter(ctx, name);
+    dist_status status = disti_enter(ctx);
     if (status == DIST_OK && texture) status = disti_texture_check(ctx, shape->net, texture);
     if (status != DIST_OK) return status;
     if (texture) {
@@ -7054,18 +7005,14 @@ static void disti_channels_task(void *arg, int index, int worker)
 DIST_API dist_status dist_shape_eval(dist_context *ctx, dist_shape *shape, size_t n, const float *points,
                                      float *channels)
 {
-    disti_channels_job job;
-    dist_status status = disti_enter(ctx, "dist_shape_eval");
+    dist_status status = disti_enter(ctx);
     if (status != DIST_OK) return status;
     if (!shape || !points || !channels)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_shape_eval: shape, points or channels is NULL", NULL, 0, 0);
     if (shape->ctx != ctx)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_shape_eval: shape belongs to another context", NULL, 0, 0);
     if (n == 0) return DIST_OK;
-    job.shape = shape;
-    job.pieces = disti_cut(n, 8 * DISTI_BLOCK, 1u << 20);
-    job.points = points;
-    job.channels = channels;
+    disti_channels_job job = {shape, disti_cut(n, 8 * DISTI_BLOCK, 1u << 20), points, channels};
     disti_run(ctx, job.pieces.count, disti_channels_task, &job);
     return DIST_OK;
 }
@@ -7247,7 +7194,7 @@ static void disti_net_pack(dist_net *net)
 DIST_API dist_status dist_net_set_half(dist_context *ctx, dist_net *net, int kind)
 {
     const char *name = "dist_net_set_half";
-    dist_status status = disti_enter(ctx, name);
+    dist_status status = disti_enter(ctx);
     if (status != DIST_OK) return status;
     if (!net) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: net is NULL", name, 0, 0);
     if (kind < DIST_HALF_OFF || kind > DIST_HALF_BF16)
@@ -7598,7 +7545,7 @@ static dist_status disti_loader_arrange(disti_loader *loader)
 DIST_API dist_net *dist_net_load(dist_context *ctx, const void *bytes, size_t size)
 {
     disti_loader loader;
-    if (disti_enter(ctx, "dist_net_load") != DIST_OK) return NULL;
+    if (disti_enter(ctx) != DIST_OK) return NULL;
     if (disti_loader_open(&loader, ctx, bytes, size) != DIST_OK) return NULL;
     loader.net = disti_net_new(ctx);
     int good = loader.net && disti_loader_arrange(&loader) == DIST_OK && disti_loader_values(&loader) == DIST_OK;
@@ -7697,7 +7644,7 @@ DIST_API dist_status dist_net_save(dist_context *ctx, const dist_net *net, void 
     unsigned char names[MOST][16];
     disti_saver saver;
     size_t count = 0;
-    dist_status status = disti_enter(ctx, "dist_net_save");
+    dist_status status = disti_enter(ctx);
     if (status != DIST_OK) return status;
     if (!net || !size)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_net_save: %s is NULL", net ? "size" : "net", 0, 0);
@@ -7768,7 +7715,7 @@ static dist_status disti_file_write(dist_context *ctx, const char *path, void *b
 DIST_API dist_net *dist_net_load_file(dist_context *ctx, const char *path)
 {
     size_t size;
-    if (disti_enter(ctx, "dist_net_load_file") != DIST_OK) return NULL;
+    if (disti_enter(ctx) != DIST_OK) return NULL;
     unsigned char *bytes = disti_file_read(ctx, "dist_net_load_file", path, &size);
     dist_net *net = bytes ? dist_net_load(ctx, bytes, size) : NULL;
     disti_free(ctx, bytes, size);
@@ -7848,7 +7795,7 @@ DIST_API dist_net *dist_net_create(dist_context *ctx, const dist_net_desc *desc)
 {
     dist_net_desc d;
     int skip[DISTI_MAX_LAYERS];
-    if (disti_enter(ctx, "dist_net_create") != DIST_OK) return NULL;
+    if (disti_enter(ctx) != DIST_OK) return NULL;
     memset(&d, 0, sizeof d);
     if (desc) d = *desc;
     if (d.layers == 0) d.layers = 8;
@@ -7897,7 +7844,7 @@ DIST_API dist_net *dist_net_create(dist_context *ctx, const dist_net_desc *desc)
 
 DIST_API dist_status dist_net_set_weights(dist_context *ctx, dist_net *net, const float *weights)
 {
-    dist_status status = disti_enter(ctx, "dist_net_set_weights");
+    dist_status status = disti_enter(ctx);
     if (status != DIST_OK) return status;
     if (!net || !weights)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_net_set_weights: %s is NULL", net ? "weights" : "net", 0, 0);
@@ -7912,7 +7859,7 @@ DIST_API dist_status dist_net_set_weights(dist_context *ctx, dist_net *net, cons
 
 DIST_API dist_status dist_net_set_code(dist_context *ctx, dist_net *net, int index, const float *code)
 {
-    dist_status status = disti_enter(ctx, "dist_net_set_code");
+    dist_status status = disti_enter(ctx);
     if (status != DIST_OK) return status;
     if (!net || !code || index < 0 || index >= net->code_count)
         return disti_fail(ctx, DIST_BAD_ARGUMENT,
@@ -9234,8 +9181,7 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
                                 const float *directions, const dist_render_desc *how, dist_hit *hits, dist_stats *stats)
 {
     disti_tracer tracer;
-    disti_free_job job;
-    dist_status status = disti_enter(ctx, "dist_trace");
+    dist_status status = disti_enter(ctx);
     if (status == DIST_OK) status = disti_field_check(ctx, field, "dist_trace");
     if (status == DIST_OK) status = disti_tracer_init(&tracer, ctx, field, how, "dist_trace");
     if (status != DIST_OK) return status;
@@ -9246,11 +9192,7 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
     if (n > (size_t)1 << 40)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_trace: n is %d, at most 2^40", NULL, (double)n, 0);
     disti_stats_begin(ctx);
-    job.tracer = &tracer;
-    job.n = n;
-    job.origins = origins;
-    job.directions = directions;
-    job.hits = hits;
+    disti_free_job job = {&tracer, n, origins, directions, hits};
     disti_run(ctx, (int)((n + DISTI_FREE_RAYS - 1) / DISTI_FREE_RAYS), disti_free_task, &job);
     disti_stats_end(ctx, &tracer, stats);
     return DIST_OK;
@@ -9412,7 +9354,7 @@ static void disti_foot_task(void *arg, int index, int worker)
 
 static dist_status disti_foot_run(disti_foot_job *job, const char *function, const void *out)
 {
-    dist_status status = disti_enter(job->ctx, function);
+    dist_status status = disti_enter(job->ctx);
     if (status == DIST_OK) status = disti_field_check(job->ctx, job->field, function);
     if (status != DIST_OK) return status;
     if (job->n > 0 && (!job->points || !out))
@@ -10396,41 +10338,36 @@ struct dist_tape {
     disti_entry *entry;     /* DISTI_CHUNK */
     float *points, *d_sdf, *d_points; /* (DISTI_CHUNK, 3), 1, 3 */
     float *hit, *d_color, *pull, *bend; /* (DISTI_RUN, 3): hits, dL/dcolor, dL/dpoint by color and by normal */
+    void *memory;           /* holds all of these */
+    size_t bytes;
 };
 
 /* counts as a hit; has a sample of smallest |f|; misses by less than how.relax_band */
 enum { DISTI_TAPE_HIT = 16, DISTI_TAPE_SAMPLE = 32, DISTI_TAPE_NEAR = 64 };
 
-static size_t disti_tape_bytes(const dist_tape *tape, int part)
+/* Returns the bytes needed; base NULL: only that. warm: also what the next picture starts from. */
+static size_t disti_tape_layout(dist_tape *tape, unsigned char *base, int warm)
 {
-    size_t pixels = (size_t)tape->width *
-                    (size_t)tape->height; /* at most 2^32: fits where size_t has 32 bits after the check */
-    size_t bytes = (size_t)-1;
-    int good = (size_t)tape->height <= (size_t)-1 / (size_t)tape->width;
-    switch (part) {
-    case 0: good = good && disti_size_mul(pixels, sizeof(float), &bytes); break;
-    case 1: bytes = pixels; break;
-    case 2:
-        good = good &&
-               disti_size_mul(pixels, tape->trace == DIST_TRACE_PAPER ? (size_t)tape->samples * 4 * sizeof(float) : 0,
-                              &bytes);
-        break;
-    case 3: bytes = DISTI_CHUNK * sizeof(disti_entry); break;
-    case 4: bytes = (DISTI_CHUNK * 7 + DISTI_RUN * 12) * sizeof(float); break;
-    case 5: good = good && disti_size_mul(pixels, 4 * sizeof(float), &bytes); break;
-    }
-    return good ? bytes : (size_t)-1;
+    size_t at = 0, pixels = (size_t)tape->width * (size_t)tape->height, each = DISTI_CHUNK, three = 3 * sizeof(float);
+    tape->s = (float *)disti_take(base, &at, pixels, sizeof(float));
+    tape->status = (unsigned char *)disti_take(base, &at, pixels, 1);
+    if (tape->trace == DIST_TRACE_PAPER)
+        tape->sample = (float *)disti_take(base, &at, pixels, (size_t)tape->samples * 4 * sizeof(float));
+    float **kept[4] = {&tape->value, &tape->start, &tape->nearest, &tape->beside};
+    for (int i = 0; i < 4 && warm; i++) *kept[i] = (float *)disti_take(base, &at, pixels, sizeof(float));
+    tape->entry = (disti_entry *)disti_take(base, &at, each, sizeof(disti_entry));
+    tape->points = (float *)disti_take(base, &at, each, three);
+    tape->d_sdf = (float *)disti_take(base, &at, each, sizeof(float));
+    tape->d_points = (float *)disti_take(base, &at, each, three);
+    float **run[4] = {&tape->hit, &tape->d_color, &tape->pull, &tape->bend};
+    for (int i = 0; i < 4; i++) *run[i] = (float *)disti_take(base, &at, DISTI_RUN, three);
+    return at;
 }
 
 DIST_API void dist_tape_destroy(dist_tape *tape)
 {
     if (!tape) return;
-    disti_free(tape->ctx, tape->points, disti_tape_bytes(tape, 4));
-    disti_free(tape->ctx, tape->entry, disti_tape_bytes(tape, 3));
-    if (tape->sample) disti_free(tape->ctx, tape->sample, disti_tape_bytes(tape, 2));
-    if (tape->value) disti_free(tape->ctx, tape->value, disti_tape_bytes(tape, 5));
-    disti_free(tape->ctx, tape->status, disti_tape_bytes(tape, 1));
-    disti_free(tape->ctx, tape->s, disti_tape_bytes(tape, 0));
+    disti_free(tape->ctx, tape->memory, tape->bytes);
     disti_free(tape->ctx, tape, sizeof *tape);
 }
 
@@ -10447,16 +10384,11 @@ static dist_status disti_tape_take(dist_context *ctx, dist_tape *tape, const dis
     tape->samples = how.samples;
     dist_status status = disti_partial_reserve(ctx, 1024); /* for codes of fields that are not nets */
     if (status != DIST_OK) return status;
-    tape->s = (float *)disti_alloc(ctx, disti_tape_bytes(tape, 0));
-    tape->status = tape->s ? (unsigned char *)disti_alloc(ctx, disti_tape_bytes(tape, 1)) : NULL;
-    if (tape->status && how.trace == DIST_TRACE_PAPER)
-        tape->sample = (float *)disti_alloc(ctx, disti_tape_bytes(tape, 2));
-    if (tape->status && how.warm_start) tape->value = (float *)disti_alloc(ctx, disti_tape_bytes(tape, 5));
-    tape->entry = tape->status ? (disti_entry *)disti_alloc(ctx, disti_tape_bytes(tape, 3)) : NULL;
-    tape->points = tape->entry ? (float *)disti_alloc(ctx, disti_tape_bytes(tape, 4)) : NULL;
-    if (!tape->points || (how.trace == DIST_TRACE_PAPER && !tape->sample) || (how.warm_start && !tape->value))
-        return DIST_OUT_OF_MEMORY;
-    return DIST_OK;
+    size_t pixels, all, each = 5 + (how.warm_start ? 16u : 0u) + (how.trace == DIST_TRACE_PAPER ? 128u : 0u);
+    int fits = disti_size_mul((size_t)tape->width, (size_t)tape->height, &pixels) && disti_size_mul(pixels, each, &all);
+    tape->bytes = fits && all < (size_t)-1 / 2 ? disti_tape_layout(tape, NULL, how.warm_start) : (size_t)-1;
+    tape->memory = disti_alloc(ctx, tape->bytes);
+    return tape->memory ? DIST_OK : DIST_OUT_OF_MEMORY;
 }
 
 static dist_status disti_tape_check(dist_context *ctx, const dist_camera *camera, const dist_render_desc *desc)
@@ -10471,24 +10403,14 @@ static dist_status disti_tape_check(dist_context *ctx, const dist_camera *camera
 
 DIST_API dist_tape *dist_tape_create(dist_context *ctx, const dist_camera *camera, const dist_render_desc *desc)
 {
-    if (disti_enter(ctx, "dist_tape_create") != DIST_OK || disti_tape_check(ctx, camera, desc) != DIST_OK) return NULL;
+    if (disti_enter(ctx) != DIST_OK || disti_tape_check(ctx, camera, desc) != DIST_OK) return NULL;
     dist_tape *tape = (dist_tape *)disti_alloc(ctx, sizeof(dist_tape));
     if (!tape) return NULL;
     if (disti_tape_take(ctx, tape, camera, desc) != DIST_OK) {
         dist_tape_destroy(tape);
         return NULL;
     }
-    if (tape->value) {
-        tape->start = tape->value + (size_t)tape->width * (size_t)tape->height;
-        tape->nearest = tape->start + (size_t)tape->width * (size_t)tape->height;
-        tape->beside = tape->nearest + (size_t)tape->width * (size_t)tape->height;
-    }
-    tape->d_sdf = tape->points + 3 * (size_t)DISTI_CHUNK;
-    tape->d_points = tape->d_sdf + DISTI_CHUNK;
-    tape->hit = tape->d_points + 3 * (size_t)DISTI_CHUNK;
-    tape->d_color = tape->hit + 3 * (size_t)DISTI_RUN;
-    tape->pull = tape->d_color + 3 * (size_t)DISTI_RUN;
-    tape->bend = tape->pull + 3 * (size_t)DISTI_RUN;
+    disti_tape_layout(tape, (unsigned char *)tape->memory, desc ? desc->warm_start : 0);
     return tape;
 }
 
@@ -10603,20 +10525,27 @@ static void disti_normal_gradient(const disti_tracer *tracer, int worker, const 
         if (!disti_finite_all(3, gradient + 3 * i)) gradient[3 * i] = gradient[3 * i + 1] = gradient[3 * i + 2] = 0.0f;
 }
 
+/* The tile's next hits from ray *i on, at most DISTI_GRADIENTS: their points and, in bench->index, which rays. */
+static size_t disti_render_hits(const disti_render_job *job, const disti_tile *tile, const disti_bench *bench, int *i,
+                                float *points)
+{
+    size_t count = 0;
+    for (; *i < tile->width * tile->height && count < DISTI_GRADIENTS; ++*i) {
+        const disti_ray *ray = &bench->rays[*i];
+        if (!disti_ray_is_hit(job->tracer, ray)) continue;
+        disti_ray_point(ray, ray->best, points + 3 * count);
+        bench->index[count++] = *i;
+    }
+    return count;
+}
+
 static void disti_render_normals(const disti_render_job *job, int worker, const disti_tile *tile,
                                  const disti_bench *bench)
 {
     const disti_tracer *tracer = job->tracer;
     float *points = (float *)(void *)bench->rest, *gradient = points + 3 * DISTI_GRADIENTS;
-    int n = tile->width * tile->height;
-    for (int i = 0; i < n;) {
-        size_t count = 0;
-        for (; i < n && count < DISTI_GRADIENTS; i++) {
-            if (!disti_ray_is_hit(tracer, &bench->rays[i])) continue;
-            disti_ray_point(&bench->rays[i], bench->rays[i].best, points + 3 * count);
-            bench->index[count++] = i;
-        }
-        if (count == 0) break;
+    size_t count;
+    for (int i = 0; (count = disti_render_hits(job, tile, bench, &i, points)) > 0;) {
         disti_normal_gradient(tracer, worker, bench, count, points, gradient);
         for (size_t k = 0; k < count; k++) {
             double g[3] = {(double)gradient[3 * k], (double)gradient[3 * k + 1], (double)gradient[3 * k + 2]},
@@ -10635,15 +10564,8 @@ static void disti_render_colors(const disti_render_job *job, int worker, const d
 {
     const dist_field *field = job->tracer->field;
     float *points = (float *)(void *)bench->rest, *color = points + 3 * DISTI_GRADIENTS;
-    int n = tile->width * tile->height;
-    for (int i = 0; i < n;) {
-        size_t count = 0;
-        for (; i < n && count < DISTI_GRADIENTS; i++) {
-            if (!disti_ray_is_hit(job->tracer, &bench->rays[i])) continue;
-            disti_ray_point(&bench->rays[i], bench->rays[i].best, points + 3 * count);
-            bench->index[count++] = i;
-        }
-        if (count == 0) break;
+    size_t count;
+    for (int i = 0; (count = disti_render_hits(job, tile, bench, &i, points)) > 0;) {
         field->color_fn(field->user, worker, count, points, color);
         bench->stats->queries += count;
         bench->stats->color_queries += count;
@@ -11694,7 +11616,7 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     disti_tracer tracer;
     disti_view view;
     disti_render_job job;
-    dist_status status = disti_enter(ctx, name);
+    dist_status status = disti_enter(ctx);
     if (status == DIST_OK) status = disti_field_check(ctx, field, name);
     if (status == DIST_OK) status = disti_camera_check(ctx, camera, name);
     if (status == DIST_OK) status = disti_tracer_init(&tracer, ctx, field, desc, name);
@@ -11939,6 +11861,16 @@ static float disti_backward_hit(disti_render_backward_job *job, const disti_ray 
     return (float)d_distance;
 }
 
+/* The ray of a pixel, and the point p of it that the tape keeps. */
+static void disti_tape_ray(const disti_render_backward_job *job, size_t pixel, double local[3], disti_ray *ray,
+                           float *p)
+{
+    const dist_tape *tape = job->tape;
+    size_t width = (size_t)tape->width;
+    disti_pixel_ray(&job->view, &tape->field, (int)(pixel % width), (int)(pixel / width), local, ray);
+    disti_ray_point(ray, tape->s[pixel], p);
+}
+
 /* One pixel with an upstream gradient; d_point and d_bend: dL/dpoint at its hit by its color and normal, or NULL. */
 static void disti_backward_pixel(disti_render_backward_job *job, size_t pixel, float d_depth, float d_distance,
                                  float d_silhouette, const float *d_point, const float *d_bend)
@@ -11950,16 +11882,14 @@ static void disti_backward_pixel(disti_render_backward_job *job, size_t pixel, f
     disti_ray ray;
     double local[3], nearest[3], pull[3];
     float p[3];
-    int x = (int)(pixel % (size_t)tape->width), y = (int)(pixel / (size_t)tape->width);
     int paper = tracer->how.gradient == DIST_GRADIENT_PAPER;
-    disti_pixel_ray(&job->view, field, x, y, local, &ray);
+    disti_tape_ray(job, pixel, local, &ray, p);
     if (ray.enter >= ray.leave) { /* off the sphere: only the camera feels it */
         disti_ray_nearest(field, &ray, nearest, pull);
         for (int i = 0; i < 3; i++) pull[i] *= (double)d_silhouette;
         disti_add_pull(job, nearest, pull, 0.0);
         return;
     }
-    disti_ray_point(&ray, tape->s[pixel], p);
     if (!(status & DISTI_TAPE_SAMPLE)) d_silhouette = 0.0f;
     d_distance += d_depth * (float)local[2];
     if (paper) { /* the tilt's share, which in the other modes goes with the hit's entry */
@@ -12014,9 +11944,7 @@ static size_t disti_backward_hits(const disti_render_backward_job *job, const fl
         disti_ray ray;
         double local[3];
         if (!disti_upstream_three(job, plane, pixel, d + 3 * n)) continue;
-        disti_pixel_ray(&job->view, &tape->field, (int)(pixel % (size_t)tape->width),
-                        (int)(pixel / (size_t)tape->width), local, &ray);
-        disti_ray_point(&ray, tape->s[pixel], tape->hit + 3 * n++);
+        disti_tape_ray(job, pixel, local, &ray, tape->hit + 3 * n++);
     }
     return n;
 }
@@ -12133,9 +12061,7 @@ static void disti_backward_outline(disti_render_backward_job *job, size_t first,
     size_t n = 0;
     for (size_t pixel = first; pixel < first + count; pixel++) {
         if (!(tape->status[pixel] & DISTI_TAPE_NEAR)) continue;
-        disti_pixel_ray(&job->view, field, (int)(pixel % (size_t)tape->width), (int)(pixel / (size_t)tape->width),
-                        local, &ray);
-        disti_ray_point(&ray, tape->s[pixel], p + 3 * n);
+        disti_tape_ray(job, pixel, local, &ray, p + 3 * n);
         if (tape->sample) memcpy(p + 3 * n, tape->sample + pixel * (size_t)tape->samples * 4 + 1, 3 * sizeof(float));
         n++;
     }
@@ -12194,7 +12120,7 @@ DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *ta
 {
     const char *name = "dist_render_backward";
     disti_render_backward_job job;
-    dist_status status = disti_enter(ctx, name);
+    dist_status status = disti_enter(ctx);
     if (status != DIST_OK) return status;
     if (!tape || !tape->rendered)
         return disti_fail(ctx, DIST_BAD_ARGUMENT,
@@ -12749,7 +12675,7 @@ static int disti_mesh_check(const dist_mesh *mesh, dist_status status, const cha
 DIST_API dist_mesh *dist_mesh_create(dist_context *ctx, size_t vertex_count, const float *vertices,
                                      size_t triangle_count, const unsigned *triangles)
 {
-    if (disti_enter(ctx, "dist_mesh_create") != DIST_OK) return NULL;
+    if (disti_enter(ctx) != DIST_OK) return NULL;
     if ((vertex_count && !vertices) || (triangle_count && !triangles)) {
         disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_create: %s is NULL, but its count is not 0",
                    vertex_count && !vertices ? "vertices" : "triangles", 0, 0);
@@ -13133,7 +13059,7 @@ DIST_API dist_mesh *dist_mesh_extract(dist_context *ctx, const dist_field *field
     disti_case cases[256];
     dist_mesh_desc d;
     int good = 0;
-    if (disti_enter(ctx, "dist_mesh_extract") != DIST_OK || disti_extract_check(ctx, field, desc) != DIST_OK)
+    if (disti_enter(ctx) != DIST_OK || disti_extract_check(ctx, field, desc) != DIST_OK)
         return NULL;
     memset(&d, 0, sizeof d);
     if (desc) d = *desc;
@@ -13186,7 +13112,7 @@ DIST_API dist_status dist_mesh_backward(dist_context *ctx, const dist_field *fie
 {
     enum { CHUNK = 4096 };
     float d_sdf[CHUNK];
-    dist_status status = disti_enter(ctx, "dist_mesh_backward");
+    dist_status status = disti_enter(ctx);
     if (status != DIST_OK) return status;
     if (!mesh || (mesh->vertex_count && !d_vertices))
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_backward: %s is NULL", mesh ? "d_vertices" : "mesh", 0, 0);
@@ -13240,7 +13166,7 @@ DIST_API dist_status dist_mesh_sample(dist_context *ctx, const dist_mesh *mesh, 
     size_t bytes, count = mesh ? mesh->triangle_count : 0;
     uint64_t random = seed;
     double sum = 0.0;
-    dist_status status = disti_enter(ctx, name);
+    dist_status status = disti_enter(ctx);
     if (status != DIST_OK) return status;
     if (!mesh || (n && !points))
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_sample: %s is NULL", mesh ? "points" : "mesh", 0, 0);
@@ -13423,11 +13349,8 @@ static void disti_chamfer_task(void *arg, int index, int worker)
 
 static dist_status disti_chamfer_one_way(dist_context *ctx, const disti_tree *from, const disti_tree *to, double *mean)
 {
-    disti_chamfer_job job;
+    disti_chamfer_job job = {from, to, disti_cut(from->n, 1024, 1u << 16), NULL};
     double sum = 0.0;
-    job.from = from;
-    job.to = to;
-    job.pieces = disti_cut(from->n, 1024, 1u << 16);
     size_t bytes = (size_t)job.pieces.count * sizeof(double); /* at most 2^16 pieces */
     job.sums = (double *)disti_alloc(ctx, bytes);
     if (!job.sums) return DIST_OUT_OF_MEMORY;
@@ -13453,7 +13376,7 @@ DIST_API dist_status dist_chamfer(dist_context *ctx, size_t n, const float *a, s
 {
     disti_tree trees[2];
     double parts[2];
-    dist_status status = disti_enter(ctx, "dist_chamfer");
+    dist_status status = disti_enter(ctx);
     if (status == DIST_OK) status = disti_chamfer_check(ctx, n, a, "a");
     if (status == DIST_OK) status = disti_chamfer_check(ctx, m, b, "b");
     if (status != DIST_OK) return status;
@@ -13527,7 +13450,7 @@ static int disti_text_number(disti_text *t, double *out)
 static dist_status disti_pfm_check(dist_context *ctx, const char *name, int width, int height, int channels,
                                    size_t *floats)
 {
-    dist_status status = disti_enter(ctx, name);
+    dist_status status = disti_enter(ctx);
     if (status != DIST_OK) return status;
     if (width < 1 || height < 1)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: the picture is %d x %d, must be at least 1 x 1", name, width,
@@ -13545,13 +13468,11 @@ DIST_API dist_status dist_pfm_write(dist_context *ctx, int width, int height, in
 {
     const char *name = "dist_pfm_write";
     size_t floats = 0;
-    disti_writer sink;
     unsigned char header[64];
+    disti_writer sink = {header, 0};
     dist_status status = disti_pfm_check(ctx, name, width, height, channels, &floats);
     if (status != DIST_OK) return status;
     if (!size) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: size is NULL", name, 0, 0);
-    sink.out = header;
-    sink.size = 0;
     disti_put_text(&sink, channels == 3 ? "PF\n" : "Pf\n");
     disti_put_size(&sink, (size_t)width);
     disti_put_text(&sink, " ");
@@ -13636,7 +13557,7 @@ DIST_API dist_status dist_pfm_read(dist_context *ctx, const void *bytes, size_t 
                                    int *channels, float *pixels, size_t capacity)
 {
     disti_pfm pfm;
-    dist_status status = disti_enter(ctx, "dist_pfm_read");
+    dist_status status = disti_enter(ctx);
     if (status != DIST_OK) return status;
     if (!bytes || !width || !height || !channels)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_pfm_read: %s is NULL",
@@ -13673,7 +13594,7 @@ DIST_API float *dist_pfm_load(dist_context *ctx, const char *path, int *width, i
     disti_pfm pfm;
     float *pixels = NULL;
     size_t size = 0;
-    if (disti_enter(ctx, name) != DIST_OK) return NULL;
+    if (disti_enter(ctx) != DIST_OK) return NULL;
     if (!path || !width || !height || !channels) {
         disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: path, width, height or channels is NULL", name, 0, 0);
         return NULL;
@@ -14031,7 +13952,7 @@ static dist_mesh *disti_mesh_parse(dist_context *ctx, const char *label, const v
 
 DIST_API dist_mesh *dist_mesh_read(dist_context *ctx, const void *bytes, size_t size)
 {
-    if (disti_enter(ctx, "dist_mesh_read") != DIST_OK) return NULL;
+    if (disti_enter(ctx) != DIST_OK) return NULL;
     if (bytes) return disti_mesh_parse(ctx, "in memory", bytes, size);
     disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_read: bytes is NULL", NULL, 0, 0);
     return NULL;
@@ -14100,8 +14021,8 @@ DIST_API dist_status dist_mesh_write(dist_context *ctx, const dist_mesh *mesh, i
                                      size_t capacity, size_t *size)
 {
     const char *name = "dist_mesh_write";
-    disti_writer sink;
-    dist_status status = disti_enter(ctx, name);
+    disti_writer sink = {NULL, 0};
+    dist_status status = disti_enter(ctx);
     if (status != DIST_OK) return status;
     if (!mesh || !size)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_write: %s is NULL", mesh ? "size" : "mesh", 0, 0);
@@ -14112,7 +14033,6 @@ DIST_API dist_status dist_mesh_write(dist_context *ctx, const dist_mesh *mesh, i
         if (!disti_finite_all(3, mesh->vertices + 3 * i) ||
             (mesh->normals && !disti_finite_all(3, mesh->normals + 3 * i)))
             return disti_fail(ctx, DIST_NOT_FINITE, "%s: vertex %d is not finite", name, (double)i, 0);
-    memset(&sink, 0, sizeof sink);
     for (int pass = 0; pass < 2; pass++) { /* counts, then writes */
         if (format == DIST_MESH_PLY) disti_write_ply(&sink, mesh);
         else disti_write_obj(&sink, mesh);
@@ -14129,7 +14049,7 @@ DIST_API dist_status dist_mesh_write(dist_context *ctx, const dist_mesh *mesh, i
 DIST_API dist_mesh *dist_mesh_load(dist_context *ctx, const char *path)
 {
     size_t size;
-    if (disti_enter(ctx, "dist_mesh_load") != DIST_OK) return NULL;
+    if (disti_enter(ctx) != DIST_OK) return NULL;
     unsigned char *bytes = disti_file_read(ctx, "dist_mesh_load", path, &size);
     dist_mesh *mesh = bytes ? disti_mesh_parse(ctx, path, bytes, size) : NULL;
     disti_free(ctx, bytes, size);
@@ -14139,7 +14059,7 @@ DIST_API dist_mesh *dist_mesh_load(dist_context *ctx, const char *path)
 DIST_API dist_status dist_mesh_save(dist_context *ctx, const dist_mesh *mesh, const char *path)
 {
     size_t size = 0, n = path ? strlen(path) : 0;
-    dist_status status = disti_enter(ctx, "dist_mesh_save");
+    dist_status status = disti_enter(ctx);
     if (status != DIST_OK) return status;
     if (!mesh || !path)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_save: %s is NULL", mesh ? "path" : "mesh", 0, 0);
@@ -14242,7 +14162,7 @@ DIST_API size_t dist_workspace_bytes(const dist_workspace_desc *desc)
     dist_net net, texture;
     dist_tape tape;
     disti_measure m;
-    dist_allocator counting;
+    dist_allocator counting = {&m, disti_measure_alloc, disti_measure_free};
     const char *name = "dist_workspace_bytes";
     memset(&d, 0, sizeof d);
     memset(&context, 0, sizeof context);
@@ -14250,9 +14170,6 @@ DIST_API size_t dist_workspace_bytes(const dist_workspace_desc *desc)
     if (desc) d = *desc;
     if (d.context) context = *d.context;
     if (!disti_allocator_of(&context, &m.allocator)) memset(&m.allocator, 0, sizeof m.allocator);
-    counting.user = &m;
-    counting.alloc_fn = disti_measure_alloc;
-    counting.free_fn = disti_measure_free;
     disti_measure_alloc(&m, sizeof ctx, DISTI_ALIGNMENT);
     dist_status status = disti_context_begin(&ctx, &context, &counting);
     if (status == DIST_OK && d.model) status = disti_measure_net(&ctx, &m, d.model, d.model_size, &net);

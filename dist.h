@@ -10053,39 +10053,45 @@ static void disti_silhouette(const disti_tracer *tracer, int worker, const disti
     float radius = tracer->field->radius, clamp = tracer->field->clamp;
     float pixel = disti_pixel_width(tracer, tile);
     /* where f between nodes, of curvature 1 / f, is off by about (4 pixels)^2 / 8 f = 1e-3 radii */
-    float far = DISTI_MIN(DISTI_MAX(0.05f, 1.5e3f * (pixel / radius) * (pixel / radius)) * radius,
-                          clamp > 0.0f ? 0.98f * clamp : 3e38f);
-    float near = pixel > 0.01f * radius ? far : 0.01f * radius; /* coarse pixels: nothing is near enough to share */
+    float plateau = clamp > 0.0f ? 0.98f * clamp : 3e38f;
+    float far = DISTI_MIN(DISTI_MAX(0.05f, 1.5e3f * (pixel / radius) * (pixel / radius)) * radius, plateau);
+    float near = pixel > 0.01f * radius ? DISTI_MIN(far, 4.0f * pixel) : 0.005f * radius; /* coarse pixels: share less */
     for (int i = 0; i < n; i++) bench->rays[i].width = 0.0f;
-    for (int h = 2 * DISTI_NODE; h >= 1; h = h == DISTI_NODE ? 1 : h / 2) {
+    for (int h = 2 * DISTI_NODE; h >= 1; h /= 2) {
+        /* nodes 2 h apart do for what lies between them from here on; f of the plateau is all the same */
+        float apart = 2.0f * (float)h / (float)DISTI_NODE, enough = DISTI_MIN(apart * apart * far, plateau);
         size_t count = 0;
         for (int i = 0; i < n; i++) {
             disti_ray *ray = &bench->rays[i];
-            int x = i % w, y = i / w, agree = 0, up = h == 1 ? (int)DISTI_NODE : 2 * h; /* nodes known, up apart */
+            int x = i % w, y = i / w, agree = 0;
             int block = y / DISTI_LEAST_BLOCK * DISTI_LEAST_ROW + x / DISTI_LEAST_BLOCK;
             float t = bench->least_of->t[block], f = bench->least_of->f[block];
             if (!disti_wants_minimum(ray) || !disti_silhouette_node(tile, x, y, h)) continue;
             if (h < 2 * DISTI_NODE) {
-                if (disti_silhouette_node(tile, x, y, up)) continue;
+                if (disti_silhouette_node(tile, x, y, 2 * h)) continue;
                 float between = 0.0f, value = 0.0f;
-                agree = disti_silhouette_between(tracer, tile, bench, x, y, up, &between, &value);
+                agree = disti_silhouette_between(tracer, tile, bench, x, y, 2 * h, &between, &value);
                 if (agree) t = between;
                 if (agree) f = value;
             }
             float s = f < 2e38f ? (float)((double)t - ray->base) : 0.0f;
-            if (agree == 4 && f > far && h == 1) disti_keep_least(ray, s, f);
-            else if (agree || h == 2 * DISTI_NODE || ray->fbest > 2e38f)
+            if (agree == 4 && f > enough) {
+                disti_keep_least(ray, s, f);
+                continue;
+            }
+            if (agree || h == 2 * DISTI_NODE || ray->fbest > 2e38f)
                 count = disti_silhouette_ask(bench, i, s, count);
-            if (h > 1) ray->width = h == DISTI_NODE ? 0.35f : 0.7f;
+            if (h >= DISTI_NODE) ray->width = h == DISTI_NODE ? 0.35f : 0.7f;
         }
         disti_silhouette_take(tracer, worker, bench, count);
-        if (h == 1) break;
+        if (h < DISTI_NODE) continue;
         for (int i = 0; i < n; i++)
             if (h == DISTI_NODE && bench->rays[i].fbest > far) bench->rays[i].width = 0.0f;
         disti_silhouette_fit(tracer, worker, bench, n);
         if (h == DISTI_NODE) continue;
         for (int i = 0; i < n; i++) /* the cones' samples are far apart: once more */
-            if (disti_silhouette_node(tile, i % w, i / w, h) && disti_wants_minimum(&bench->rays[i]))
+            if (disti_silhouette_node(tile, i % w, i / w, h) && disti_wants_minimum(&bench->rays[i]) &&
+                bench->rays[i].fbest < DISTI_MIN(4.0f * far, plateau))
                 bench->rays[i].width = 0.35f;
         disti_silhouette_fit(tracer, worker, bench, n);
     }

@@ -8080,7 +8080,7 @@ typedef struct disti_ray {
     float s, f;         /* front: nothing lies before it */
     float slope;        /* df/ds of the last two samples */
     float a, fa, b, fb; /* bracket: fa > 0 >= fb, a < b; while marching b, fb: a sample beyond a gap, fb = 0: none */
-    float width;        /* bracket's width at first */
+    float width;        /* bracket's width at first; before: longest first step to trust, in epsilons */
     float best, fbest;  /* sample of smallest |f| */
     float error;
     float sign;         /* -1: looking for the way out of the solid */
@@ -8324,7 +8324,8 @@ static int disti_ray_bracket(const disti_tracer *tracer, disti_ray *ray)
     return disti_ray_ask(ray, DISTI_BRACKET, q);
 }
 
-/* A sample inside the bracket. The error is judged in s: |f| over the slopes to the bracket's ends. */
+/* A sample inside the bracket. The error is judged in s: |f| over the slopes to the bracket's ends; where these are
+   alike, by how far apart what they foretell is. */
 static int disti_ray_bracketed(const disti_tracer *tracer, disti_ray *ray, float f)
 {
     float tolerance = 0.25f * disti_ray_epsilon(tracer, ray, ray->q);
@@ -8334,7 +8335,10 @@ static int disti_ray_bracketed(const disti_tracer *tracer, disti_ray *ray, float
     float other = inside ? slope_b : slope_a;
     float magnitude = f < 0.0f ? -f : f;
     float flatter = DISTI_MIN(slope, other > 0.0f ? other : -other);
-    if (slope > 1e-3f && magnitude <= tolerance * DISTI_MIN(0.5f * slope, flatter)) {
+    float steeper = DISTI_MAX(slope, other);
+    int alike = flatter > 0.0f && magnitude <= 16.0f * tolerance * flatter &&
+                magnitude * (steeper - flatter) <= 0.25f * tolerance * flatter * steeper;
+    if (slope > 1e-3f && (magnitude <= tolerance * DISTI_MIN(0.5f * slope, flatter) || alike)) {
         ray->slope = -slope;
         float width = ray->b - ray->a, off = magnitude + tracer->noise;
         float error = disti_ray_kink(tracer, ray, flatter);
@@ -8574,19 +8578,20 @@ static int disti_ray_aim(disti_ray *ray)
     return disti_ray_ask(ray, DISTI_PREDICT, ray->target);
 }
 
-/* A sample where the neighbors' hits and slopes predicted this ray's: Newton's steps, the first by their slope, the
-   others by its own. A step too long to trust, or f that does not shrink, sends the ray back to its front. */
+/* A sample where the neighbors' hits and slopes predicted this ray's: Newton's steps, the first by their slope, as long
+   as these are alike (it is off by about its length times 3 % and half of what they differ), the others by its own. A
+   step too long to trust, or f that does not shrink, sends the ray back to its front. */
 static int disti_ray_predicted(const disti_tracer *tracer, disti_ray *ray, float f)
 {
     float epsilon = disti_ray_epsilon(tracer, ray, ray->q);
     int first = ray->fa > 2e38f, fronted = ray->f > 0.0f;
-    int trusted = first && ray->side == 0 && ray->incline < -0.3f * tracer->lipschitz;
+    int trusted = first && ray->width > 0.0f;
     float slope = first ? ray->incline : (f - ray->fa) / (ray->q - ray->a);
     float step = -f / slope, length = step < 0.0f ? -step : step;
     float magnitude = f < 0.0f ? -f : f, before = ray->fa < 0.0f ? -ray->fa : ray->fa;
     int good = slope < -0.12f * tracer->lipschitz && length < 0.03f * tracer->field->radius && magnitude < before &&
                ray->side < 5;
-    if (good && (trusted || !first) && length <= (trusted ? 4.0f : 12.0f) * epsilon) {
+    if (good && (trusted || !first) && length <= (trusted ? ray->width : 12.0f) * epsilon) {
         float off = ray->q + step - ray->target;
         ray->slope = slope;
         ray->off = DISTI_MAX(off < 0.0f ? -off : off, 1e-9f);
@@ -9687,6 +9692,8 @@ typedef struct disti_guess {
     float depth, slope;
     int quality; /* 3: by four hits alike, 2: good, 1: but the slope is anyone's guess, -1: beyond an edge, 0: none */
     float off;   /* how far the prediction was from the neighbors; 0: unknown */
+    float spread; /* of the neighbors' slopes, relative to their mean */
+    float differ; /* of the cubics along the two axes */
     float sag;   /* how far the cubic is from the line */
 } disti_guess;
 
@@ -9711,6 +9718,8 @@ static disti_guess disti_predict_axis(const disti_tracer *tracer, const disti_ra
     float across = 4.0f * (float)h * ray->footprint * DISTI_MAX(z1, z2);
     float inverse = 0.5f * (1.0f / z1 + 1.0f / z2);
     guess.slope = mean;
+    guess.differ = 3e38f;
+    guess.spread = (flatter - DISTI_MIN(slope1, slope2)) / -mean;
     guess.quality = flatter <= 0.4f * DISTI_MIN(slope1, slope2) ? 2 : 1;
     if (gap > near || gap > 1.2f * (tangent + 0.3f) * across) {
         float z = z1 > z2 ? z1 : z2, beyond = z1 > z2 ? a : b;
@@ -9731,7 +9740,8 @@ static disti_guess disti_predict_axis(const disti_tracer *tracer, const disti_ra
 }
 
 /* Sets up pixel (x, y) for its first query, half way between pixels at distance h known along x, y or both. 0: it
-   needs none: between four hits alike which were themselves predicted to within epsilon, it is interpolated. */
+   needs none: between four hits alike which were themselves predicted to within half of epsilon, or to within two where
+   those along x and along y say the same, it is interpolated. */
 static int disti_predict(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench, int x, int y,
                           int h)
 {
@@ -9744,10 +9754,12 @@ static int disti_predict(const disti_tracer *tracer, const disti_tile *tile, con
     if (odd_x && odd_y) {
         other = disti_predict_axis(tracer, ray, depth, y, tile->height, h, tile->width);
         if (guess.quality > 0 && other.quality > 0) {
+            guess.differ = guess.depth < other.depth ? other.depth - guess.depth : guess.depth - other.depth;
             guess.depth = 0.5f * (guess.depth + other.depth);
             guess.slope = 0.5f * (guess.slope + other.slope);
             guess.off = guess.off > 0.0f && other.off > 0.0f ? DISTI_MAX(guess.off, other.off) : 0.0f;
             guess.sag = DISTI_MAX(guess.sag, other.sag);
+            guess.spread = DISTI_MAX(guess.spread, other.spread);
             guess.quality = DISTI_MIN(guess.quality, other.quality);
         } else {
             if (guess.quality <= 0 && other.quality > 0) guess = other;
@@ -9763,9 +9775,12 @@ static int disti_predict(const disti_tracer *tracer, const disti_tile *tile, con
     ray->aim = (unsigned char)(guess.quality >= 2 ? 1 : 2);
     ray->target = s;
     ray->incline = guess.slope;
+    if (guess.quality >= 2 && guess.slope < -0.3f * tracer->lipschitz) /* else 0: a second query makes sure */
+        ray->width = DISTI_MAX(4.0f, 0.35f / (0.03f + 0.5f * guess.spread));
     ray->s = ray->start;
     if (guess.quality > 0 && disti_ray_aims(tracer, ray, ray->guard - 1e-3f * tracer->field->radius)) {
-        if (h == 1 && guess.quality == 3 && guess.off > 0.0f && guess.off <= epsilon) {
+        int alike = guess.off <= 0.5f * epsilon || (guess.off <= 2.0f * epsilon && guess.differ <= 0.5f * epsilon);
+        if (h == 1 && guess.quality == 3 && guess.off > 0.0f && alike) {
             ray->slope = guess.slope;
             ray->off = guess.off;
             /* at a crease amid the four, where the cubic is off by up to three times what it differs from the line */

@@ -8324,8 +8324,7 @@ static int disti_ray_bracket(const disti_tracer *tracer, disti_ray *ray)
     return disti_ray_ask(ray, DISTI_BRACKET, q);
 }
 
-/* A sample inside the bracket. The error is judged in s: |f| over the slopes to the bracket's ends; where these are
-   alike, by how far apart what they foretell is. */
+/* A sample inside the bracket. The error is judged in s: |f| over the slopes to the bracket's ends. */
 static int disti_ray_bracketed(const disti_tracer *tracer, disti_ray *ray, float f)
 {
     float tolerance = 0.25f * disti_ray_epsilon(tracer, ray, ray->q);
@@ -8335,10 +8334,7 @@ static int disti_ray_bracketed(const disti_tracer *tracer, disti_ray *ray, float
     float other = inside ? slope_b : slope_a;
     float magnitude = f < 0.0f ? -f : f;
     float flatter = DISTI_MIN(slope, other > 0.0f ? other : -other);
-    float steeper = DISTI_MAX(slope, other);
-    int alike = flatter > 0.0f && magnitude <= 16.0f * tolerance * flatter &&
-                magnitude * (steeper - flatter) <= 0.25f * tolerance * flatter * steeper;
-    if (slope > 1e-3f && (magnitude <= tolerance * DISTI_MIN(0.5f * slope, flatter) || alike)) {
+    if (slope > 1e-3f && magnitude <= tolerance * DISTI_MIN(0.5f * slope, flatter)) {
         ray->slope = -slope;
         float width = ray->b - ray->a, off = magnitude + tracer->noise;
         float error = disti_ray_kink(tracer, ray, flatter);
@@ -9929,8 +9925,9 @@ static void disti_trace_doubt(const disti_tracer *tracer, const disti_tile *tile
 
 /* Soft silhouette of the rays that miss: min |f| along each. Cones, balls and stretched steps leave no sample near the
    minimum, so it is looked for. Nodes, every 8th and then every 4th pixel, fit a parabola around their least sample or
-   their block's (4 queries); between them the distance of the minimum is interpolated (1 query), far from the outline
-   f as well (none); near the outline a pixel also looks where its neighbors' minima are, and fits a parabola. A value
+   their block's (4 queries); then every 2nd pixel and all others get it where their nodes have it (1 query). Where f is
+   so large that the nodes do, it is interpolated as well (none): what that is off by goes with the square of the nodes'
+   distance over f. Near the outline a pixel also looks where its neighbors' minima are, and fits a parabola. A value
    off by ds costs ds^2 / 2 times the curvature: first-order exact (envelope theorem). */
 static int disti_wants_minimum(const disti_ray *ray)
 {
@@ -10070,10 +10067,10 @@ static void disti_silhouette(const disti_tracer *tracer, int worker, const disti
     /* where f between nodes, of curvature 1 / f, is off by about (4 pixels)^2 / 8 f = 1e-3 radii */
     float plateau = clamp > 0.0f ? 0.98f * clamp : 3e38f;
     float far = DISTI_MIN(DISTI_MAX(0.05f, 1.5e3f * (pixel / radius) * (pixel / radius)) * radius, plateau);
-    float near = pixel > 0.01f * radius ? DISTI_MIN(far, 4.0f * pixel) : 0.005f * radius; /* coarse pixels: share less */
+    float near = pixel > 0.01f * radius ? 0.5f * far : 0.005f * radius; /* coarse pixels have less to share */
     for (int i = 0; i < n; i++) bench->rays[i].width = 0.0f;
     for (int h = 2 * DISTI_NODE; h >= 1; h /= 2) {
-        /* nodes 2 h apart do for what lies between them from here on; f of the plateau is all the same */
+        /* from this f on nodes 2 h apart do for what lies between them; that of a plateau is all the same */
         float apart = 2.0f * (float)h / (float)DISTI_NODE, enough = DISTI_MIN(apart * apart * far, plateau);
         size_t count = 0;
         for (int i = 0; i < n; i++) {

@@ -2081,8 +2081,9 @@ DISTI_PLAIN(scalar, static)
      DISTI_KEEP(v, bits)                v with 0 where the lane's bit is 0
      DISTI_TALL(isa)                    tiles of one vector's columns, where there are registers for sixteen rows
      DISTI_FEW(isa)                     the reverse pass of up to four rows, where other tiles are higher
-     DISTI_DEPTH                        rows that one pass takes: 112 of 192 bytes stay in a first cache of 32 KiB
-                                        beside the weights; wider vectors ask for less and can use the second cache
+     DISTI_DEPTH                        rows that one pass takes: the columns of a tile in them, 128 bytes of a row
+                                        for AVX2, stay in a first cache of 32 KiB beside the weights; wider vectors
+                                        ask for less and can use the second cache
    A tile of R rows and V vectors keeps its sums in variables a<row><vector>: gcc holds those in registers where it
    would spill an array. A row's factor is broadcast and serves its V vectors; in the forward pass the factors of a
    tile stand side by side, elsewhere at R offsets k<row>. */
@@ -2346,9 +2347,9 @@ DISTI_PLAIN(scalar, static)
 
 /* All tiles of `total` rows, eight at a time: their strips are R rows high where W vectors wide, else eight. */
 #define DISTI_EACH(kernel, isa, first, total, columns, R, W, arguments)                                                \
-    for (int row = first; row < (total); row += 8) {                                                                   \
-        for (int c = 0; c < (columns); c += W * DISTI_LANES) {                                                         \
-            const int vectors = DISTI_VECTORS((columns) - c);                                                          \
+    for (int c = 0; c < (columns); c += W * DISTI_LANES) {                                                             \
+        const int vectors = DISTI_VECTORS((columns) - c);                                                              \
+        for (int row = first; row < (total); row += 8) {                                                               \
             for (int n = row; n < row + 8 && n < (total); n += vectors >= W ? R : 8) {                                 \
                 if (vectors >= W) disti_##kernel##_wide_##isa arguments;                                               \
                 else if (vectors == 2) disti_##kernel##_middle_##isa arguments;                                        \
@@ -2521,7 +2522,7 @@ DISTI_FUNCTION __m256 disti_keep_avx2(__m256 v, int bits)
     const __m256i both = _mm256_and_si256(_mm256_set1_epi32(bits), lane);
     return _mm256_and_ps(v, _mm256_castsi256_ps(_mm256_cmpeq_epi32(both, lane)));
 }
-#define DISTI_DEPTH 112
+#define DISTI_DEPTH 176
 DISTI_KERNELS(avx2, 4, 3)
 #define DISTI_ABS(v) _mm256_andnot_ps(_mm256_set1_ps(-0.0f), v)
 DISTI_BOUND(avx2)

@@ -11599,11 +11599,12 @@ static int disti_render_predicts(const disti_tracer *tracer, const disti_view *v
     return disti_view_away(view, tracer->field) < 0.01 * (double)tracer->field->radius * f;
 }
 
-/* Mean |f| at up to 1024 of the tape's hits, evenly over the picture: how much has changed. 3e38: it has none. */
+/* Mean |f| at up to 1024 of the tape's hits, at most one in 16, evenly over the picture: how much has changed. 3e38: it
+   has none. */
 static float disti_render_change(disti_tracer *tracer, const disti_view *view, dist_tape *tape)
 {
     enum { SIDE = 32 };
-    int dx = (view->width + SIDE - 1) / SIDE, dy = (view->height + SIDE - 1) / SIDE;
+    int dx = DISTI_MAX((view->width + SIDE - 1) / SIDE, 4), dy = DISTI_MAX((view->height + SIDE - 1) / SIDE, 4);
     size_t count = 0;
     double local[3], sum = 0.0;
     disti_bench bench;

@@ -8094,6 +8094,7 @@ typedef struct disti_ray {
     float target, incline; /* s, df/ds there */
     float off;             /* of a hit: how far the neighbors' prediction was from it; 0: there was none */
     unsigned char kept;  /* warm start: verified, not traced; a miss's best is where |f| is least */
+    unsigned char own;   /* incline is df/ds at q: the sample came with its gradient; of a hit: it is the normal's */
     float stop;          /* warm start: start as the cones left it */
 } disti_ray;
 
@@ -8576,21 +8577,22 @@ static int disti_ray_aim(disti_ray *ray)
 }
 
 /* A sample where the neighbors' hits and slopes predicted this ray's: Newton's steps, the first by their slope, as long
-   as these are alike (it is off by about its length times 3 % and half of what they differ), the others by its own. A
-   step too long to trust, or f that does not shrink, sends the ray back to its front. */
+   as these are alike (it is off by about its length times 3 % and half of what they differ), the others, and any for a
+   sample that came with its gradient, by its own. A step too long to trust, or f that does not shrink, sends the ray
+   back to its front. */
 static int disti_ray_predicted(const disti_tracer *tracer, disti_ray *ray, float f)
 {
     float epsilon = disti_ray_epsilon(tracer, ray, ray->q);
-    int first = ray->fa > 2e38f, fronted = ray->f > 0.0f;
-    int trusted = first && ray->width > 0.0f;
-    float slope = first ? ray->incline : (f - ray->fa) / (ray->q - ray->a);
+    int first = ray->fa > 2e38f, fronted = ray->f > 0.0f, foreign = first && !ray->own;
+    float slope = first || ray->own ? ray->incline : (f - ray->fa) / (ray->q - ray->a);
     float step = -f / slope, length = step < 0.0f ? -step : step;
     float magnitude = f < 0.0f ? -f : f, before = ray->fa < 0.0f ? -ray->fa : ray->fa;
     int good = slope < -0.12f * tracer->lipschitz && length < 0.03f * tracer->field->radius && magnitude < before &&
                ray->side < 5;
-    if (good && (trusted || !first) && length <= (trusted ? ray->width : 12.0f) * epsilon) {
+    if (good && (!foreign || ray->width > 0.0f) && length <= (foreign ? ray->width : 12.0f) * epsilon) {
         float off = ray->q + step - ray->target;
         ray->slope = slope;
+        if (length > 0.125f * (float)(ray->base + (double)ray->q) * ray->footprint) ray->own = 0; /* of a pixel: 1/16 */
         ray->off = DISTI_MAX(off < 0.0f ? -off : off, 1e-9f);
         /* short of the surface nothing tells whether f flattens on the way, most likely where it is flat already */
         float factor = f > 0.0f && slope > -0.6f * tracer->lipschitz ? 10.0f : 2.0f;
@@ -8778,6 +8780,7 @@ typedef struct disti_bench { /* the work bench of one task */
     disti_ray *rays;   /* DISTI_TILE_RAYS */
     float *points;     /* (DISTI_TILE_RAYS, 3) */
     float *sdf;        /* DISTI_TILE_RAYS */
+    float *gradient;   /* NULL, or (2, DISTI_TILE_RAYS, 3): of a round's samples, and grad f at hits that are `own` */
     float *depth;      /* DISTI_TILE_RAYS: of the rays that are hits so far, for their neighbors; 0: none */
     int *index;        /* DISTI_TILE_RAYS */
     unsigned char *rest; /* what else a task wants: DISTI_REST_BYTES */
@@ -8803,6 +8806,7 @@ static void disti_bench_init(const dist_context *ctx, int worker, disti_bench *b
     bench->rest = (unsigned char *)disti_take(base, &at, DISTI_REST_BYTES, 1);
     bench->least_of = (disti_least *)disti_take(base, &at, 1, sizeof(disti_least));
     bench->balls = NULL;
+    bench->gradient = NULL;
     bench->budget = NULL;
     bench->width = bench->height = bench->cones = 0;
     bench->least = 0.0f;
@@ -8817,9 +8821,12 @@ static unsigned long long disti_share(const disti_tracer *tracer, double part, d
     return part >= whole ? most : (unsigned long long)((double)most * (part / whole));
 }
 
-/* Evaluates f at the first `count` of bench->points, or at as many as the budget has room for; returns how many. */
-static size_t disti_query(const disti_tracer *tracer, int worker, const disti_bench *bench, size_t count)
+/* Evaluates f at the first `count` of bench->points, or at as many as the budget has room for, and its gradient at the
+   first `sloped` of them; returns how many. */
+static size_t disti_query_sloped(const disti_tracer *tracer, int worker, const disti_bench *bench, size_t count,
+                                 size_t sloped)
 {
+    const dist_field *field = tracer->field;
     disti_budget *budget = bench->budget;
     if (budget) {
         unsigned long long owed = budget->hits * budget->per_hit, room = budget->left > owed ? budget->left - owed : 0;
@@ -8827,9 +8834,17 @@ static size_t disti_query(const disti_tracer *tracer, int worker, const disti_be
         count = (size_t)DISTI_MIN((unsigned long long)count, room);
         budget->left -= count;
     }
-    if (count > 0) tracer->field->eval_fn(tracer->field->user, worker, count, bench->points, bench->sdf, NULL);
+    sloped = DISTI_MIN((sloped + DISTI_BLOCK - 1) / DISTI_BLOCK * DISTI_BLOCK, count); /* others fill its last block */
+    if (sloped > 0) field->eval_fn(field->user, worker, sloped, bench->points, bench->sdf, bench->gradient);
+    if (count > sloped)
+        field->eval_fn(field->user, worker, count - sloped, bench->points + 3 * sloped, bench->sdf + sloped, NULL);
     bench->stats->queries += count;
     return count;
+}
+
+static size_t disti_query(const disti_tracer *tracer, int worker, const disti_bench *bench, size_t count)
+{
+    return disti_query_sloped(tracer, worker, bench, count, 0);
 }
 
 static void disti_ray_point(const disti_ray *ray, float s, float p[3])
@@ -9011,24 +9026,51 @@ static float disti_hit_depth(const disti_ray *ray)
     return (float)(ray->base + (double)ray->best) * ray->cosine;
 }
 
+/* Where grad f of the ray's last sample stands, if that is `own`. */
+static float *disti_bench_gradient(const disti_bench *bench, int index)
+{
+    return bench->gradient + 3 * (DISTI_TILE_RAYS + (size_t)index);
+}
+
+/* Exchanges two of the points to be asked for, and their rays. */
+static void disti_bench_swap(const disti_bench *bench, size_t i, size_t j)
+{
+    float p[3], *a = bench->points + 3 * i, *b = bench->points + 3 * j;
+    int index = bench->index[i];
+    memcpy(p, a, sizeof p);
+    memcpy(a, b, sizeof p);
+    memcpy(b, p, sizeof p);
+    bench->index[i] = bench->index[j];
+    bench->index[j] = index;
+}
+
 /* Marches the `active` rays listed in bench->index, in rounds: one packed batch of points a round, until only `enough`
-   are left. Returns how many are still listed. Without budget they stay as they are: 0. */
+   are left. Returns how many are still listed. Without budget they stay as they are: 0. With bench->gradient predicted
+   samples come with their gradients: most are the last of their rays, next to the hit, and serve the normals, too. */
 static size_t disti_trace_rounds(const disti_tracer *tracer, int worker, const disti_bench *bench, size_t active,
                                  size_t enough)
 {
     while (active > enough) {
-        size_t kept = 0;
+        size_t kept = 0, sloped = 0;
         for (size_t i = 0; i < active; i++) {
             disti_ray *ray = &bench->rays[bench->index[i]];
             if (bench->balls && !disti_skip(bench, bench->index[i], ray)) continue;
             disti_ray_point(ray, ray->q, bench->points + 3 * kept);
-            bench->index[kept++] = bench->index[i];
+            bench->index[kept] = bench->index[i];
+            ray->own = bench->gradient && ray->mode == DISTI_PREDICT;
+            if (ray->own) disti_bench_swap(bench, sloped++, kept);
+            kept++;
         }
-        size_t asked = disti_query(tracer, worker, bench, kept);
+        size_t asked = disti_query_sloped(tracer, worker, bench, kept, sloped);
         active = kept;
         kept = 0;
         for (size_t i = 0; i < asked; i++) {
             disti_ray *ray = &bench->rays[bench->index[i]];
+            if (ray->own) {
+                const float *g = bench->gradient + 3 * i, *v = ray->direction;
+                ray->incline = (g[0] * v[0] + g[1] * v[1] + g[2] * v[2]) * ray->sign;
+                memcpy(disti_bench_gradient(bench, bench->index[i]), g, 3 * sizeof(float));
+            }
             if (ray->mode >= DISTI_BAND) bench->stats->refine_queries++;
             else bench->stats->march_queries++;
             if (bench->balls) disti_publish(tracer, bench, bench->index[i], bench->points + 3 * i, bench->sdf[i]);
@@ -9396,6 +9438,7 @@ typedef struct disti_tile {
     const size_t *list; /* pixels of the rays, which then stand in one row; NULL: a rectangle */
     int x, y, width, height; /* traced: at most DISTI_TILE + 1 each */
     int own_width, own_height; /* written */
+    int normals; /* 1: grad f is wanted at hits */
     int lazy; /* 1: only the rays that the cones leave are made; of the others no more is known than that they miss */
 } disti_tile;
 
@@ -9862,6 +9905,8 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
         disti_outline(tracer, worker, tile, bench);
         memcpy(bench->index, later, active * sizeof(int));
     }
+    DIST_ASSERT(6 * DISTI_TILE_RAYS * sizeof(float) <= DISTI_REST_BYTES);
+    if (cheap && tile->normals) bench->gradient = (float *)(void *)bench->rest; /* the cones are done with */
     for (int h = DISTI_LATTICE / 2; h > 0; h /= 2) {
         if (bench->balls) bench->balls->stride = h;
         if (bench->balls) bench->balls->window = DISTI_MIN(h + 3, 6);
@@ -10544,37 +10589,43 @@ static void disti_normal_gradient(const disti_tracer *tracer, int worker, const 
         if (!disti_finite_all(3, gradient + 3 * i)) gradient[3 * i] = gradient[3 * i + 1] = gradient[3 * i + 2] = 0.0f;
 }
 
-/* The tile's next hits from ray *i on, at most DISTI_GRADIENTS: their points and, in bench->index, which rays. */
-static size_t disti_render_hits(const disti_render_job *job, const disti_tile *tile, const disti_bench *bench, int *i,
-                                float *points)
+/* The tile's next hits from ray *i on, at most DISTI_GRADIENTS: their points and, in bench->index, which rays. known 0:
+   but those whose gradient is known. */
+static size_t disti_render_hits(const disti_render_job *job, const disti_tile *tile, const disti_bench *bench, int known,
+                                int *i, float *points)
 {
     size_t count = 0;
     for (; *i < tile->width * tile->height && count < DISTI_GRADIENTS; ++*i) {
         const disti_ray *ray = &bench->rays[*i];
-        if (!disti_ray_is_hit(job->tracer, ray)) continue;
+        if (!disti_ray_is_hit(job->tracer, ray) || (ray->own && !known)) continue;
         disti_ray_point(ray, ray->best, points + 3 * count);
         bench->index[count++] = *i;
     }
     return count;
 }
 
+static void disti_render_normal(const disti_render_job *job, const disti_tile *tile, int index, const float *gradient)
+{
+    double g[3] = {(double)gradient[0], (double)gradient[1], (double)gradient[2]}, normal[3];
+    if (!disti_normalize(g)) return;
+    if (job->tracer->how.normal_space == DIST_SPACE_WORLD) memcpy(normal, g, sizeof normal);
+    else disti_rotate(tile->view->rotation, g, normal);
+    float *to = job->out->normal + 3 * disti_tile_pixel(tile, index);
+    for (size_t axis = 0; axis < 3; axis++) to[axis] = (float)normal[axis];
+}
+
 static void disti_render_normals(const disti_render_job *job, int worker, const disti_tile *tile,
                                  const disti_bench *bench)
 {
     const disti_tracer *tracer = job->tracer;
-    float *points = (float *)(void *)bench->rest, *gradient = points + 3 * DISTI_GRADIENTS;
+    float *points = (float *)(void *)bench->rest + 6 * DISTI_TILE_RAYS, *gradient = points + 3 * DISTI_GRADIENTS;
     size_t count;
-    for (int i = 0; (count = disti_render_hits(job, tile, bench, &i, points)) > 0;) {
+    for (int i = 0; i < tile->width * tile->height; i++)
+        if (disti_ray_is_hit(tracer, &bench->rays[i]) && bench->rays[i].own)
+            disti_render_normal(job, tile, i, disti_bench_gradient(bench, i));
+    for (int i = 0; (count = disti_render_hits(job, tile, bench, 0, &i, points)) > 0;) {
         disti_normal_gradient(tracer, worker, bench, count, points, gradient);
-        for (size_t k = 0; k < count; k++) {
-            double g[3] = {(double)gradient[3 * k], (double)gradient[3 * k + 1], (double)gradient[3 * k + 2]},
-                   normal[3];
-            if (!disti_normalize(g)) continue;
-            if (tracer->how.normal_space == DIST_SPACE_WORLD) memcpy(normal, g, sizeof normal);
-            else disti_rotate(tile->view->rotation, g, normal);
-            size_t pixel = disti_tile_pixel(tile, bench->index[k]);
-            for (size_t axis = 0; axis < 3; axis++) job->out->normal[3 * pixel + axis] = (float)normal[axis];
-        }
+        for (size_t k = 0; k < count; k++) disti_render_normal(job, tile, bench->index[k], gradient + 3 * k);
     }
 }
 
@@ -10584,7 +10635,7 @@ static void disti_render_colors(const disti_render_job *job, int worker, const d
     const dist_field *field = job->tracer->field;
     float *points = (float *)(void *)bench->rest, *color = points + 3 * DISTI_GRADIENTS;
     size_t count;
-    for (int i = 0; (count = disti_render_hits(job, tile, bench, &i, points)) > 0;) {
+    for (int i = 0; (count = disti_render_hits(job, tile, bench, 1, &i, points)) > 0;) {
         field->color_fn(field->user, worker, count, points, color);
         bench->stats->queries += count;
         bench->stats->color_queries += count;
@@ -11467,6 +11518,7 @@ static void disti_render_task(void *arg, int index, int worker)
     disti_bench_init(tracer->ctx, worker, &bench);
     tile.view = job->view;
     tile.list = NULL;
+    tile.normals = job->out->normal && tracer->how.normal_mode == DIST_NORMAL_ANALYTIC;
     tile.x = index % job->across * job->tile;
     tile.y = index / job->across * job->tile;
     tile.own_width = tile.width = DISTI_MIN(job->tile, job->view->width - tile.x);

@@ -9438,7 +9438,7 @@ typedef struct disti_tile {
     const size_t *list; /* pixels of the rays, which then stand in one row; NULL: a rectangle */
     int x, y, width, height; /* traced: at most DISTI_TILE + 1 each */
     int own_width, own_height; /* written */
-    int normals; /* 1: grad f is wanted at hits */
+    int cheap, normals; /* 1: queries cost less than bookkeeping; grad f is wanted at hits */
     int lazy; /* 1: only the rays that the cones leave are made; of the others no more is known than that they miss */
 } disti_tile;
 
@@ -9842,9 +9842,6 @@ static float disti_pixel_width(const disti_tracer *tracer, const disti_tile *til
     return (float)(sqrt(disti_dot(c, c)) / DISTI_MAX(fabs(tile->view->fx), fabs(tile->view->fy)));
 }
 
-/* A field that costs less than this many multiply-adds is asked sooner than a ray looks for balls. */
-static const float DISTI_CHEAP = 5000.0f;
-
 /* Cones for the parts of a tile's blocks between lattice pixels that are not all hits: the outline passes there, and
    rays that only come near take many queries. For rays that have not set out. */
 static void disti_outline(const disti_tracer *tracer, int worker, const disti_tile *tile, disti_bench *bench)
@@ -9887,9 +9884,8 @@ static void disti_lattice_balls(const disti_tracer *tracer, const disti_tile *ti
 static void disti_trace_lattice(const disti_tracer *tracer, int worker, const disti_tile *tile, disti_bench *bench)
 {
     size_t active = 0;
-    float cost = tracer->field->cost;
-    int later[DISTI_LATER], cheap = tile->lazy && cost > 0.0f && cost < DISTI_CHEAP;
-    if (!cheap) disti_lattice_balls(tracer, tile, bench);
+    int later[DISTI_LATER];
+    if (!tile->cheap) disti_lattice_balls(tracer, tile, bench);
     for (int i = 0, y = 0; y < tile->height; y++) {
         for (int x = 0; x < tile->width; x++, i++) {
             disti_ray *ray = &bench->rays[i];
@@ -9906,7 +9902,7 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
         memcpy(bench->index, later, active * sizeof(int));
     }
     DIST_ASSERT(6 * DISTI_TILE_RAYS * sizeof(float) <= DISTI_REST_BYTES);
-    if (cheap && tile->normals) bench->gradient = (float *)(void *)bench->rest; /* the cones are done with */
+    if (tile->cheap && tile->normals) bench->gradient = (float *)(void *)bench->rest; /* the cones are done with */
     for (int h = DISTI_LATTICE / 2; h > 0; h /= 2) {
         if (bench->balls) bench->balls->stride = h;
         if (bench->balls) bench->balls->window = DISTI_MIN(h + 3, 6);
@@ -10501,6 +10497,7 @@ typedef struct disti_render_job {
     int least;   /* misses need their smallest f: for the silhouette or the relaxed boundary */
     int warm;    /* and from what the tape's picture found */
     int lazy;    /* nothing is wanted of rays that miss */
+    int cheap;   /* and a query costs so little that it is asked sooner than a ray looks for balls */
     float step;  /* three pixels' width at the field's center */
     float change; /* mean change of f at the tape's hits */
     size_t first[DISTI_LIST_TASKS + 1]; /* disti_render_list: first pixel of each task */
@@ -11532,6 +11529,7 @@ static void disti_render_task(void *arg, int index, int worker)
     int n = tile.width * tile.height, open = 1;
     unsigned long long met = bench.stats->rays_in_sphere;
     tile.lazy = job->lazy;
+    tile.cheap = job->cheap;
     if (!tile.lazy) disti_tile_rays(tracer, &tile, &bench, 0, 0, tile.width, tile.height);
 #ifndef DIST_NO_PAPER
     if (tracer->how.trace == DIST_TRACE_PAPER) {
@@ -11715,15 +11713,16 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     job.view = &view;
     job.out = out;
     job.tape = tape;
-    job.tile = tracer.how.trace == DIST_TRACE_PAPER || (double)view.width * view.height < 384.0 * 384.0
-                   ? DISTI_TILE_USUAL / 2
-                   : field->many ? DISTI_TILE
-                                 : DISTI_TILE_USUAL;
-    job.across = (view.width + job.tile - 1) / job.tile;
     job.predict = disti_render_predicts(&tracer, &view);
     job.least = out->silhouette || (tape && tracer.how.relax_band > 0.0f);
     job.lazy = !job.least && !tape && !tracer.how.pixels && !tracer.how.no_cones &&
                tracer.how.trace == DIST_TRACE_GUARDED;
+    job.cheap = job.lazy && field->cost > 0.0f && field->cost < 5000.0f;
+    job.tile = tracer.how.trace == DIST_TRACE_PAPER || (double)view.width * view.height < 384.0 * 384.0
+                   ? DISTI_TILE_USUAL / 2
+               : field->many || job.cheap ? DISTI_TILE
+                                          : DISTI_TILE_USUAL;
+    job.across = (view.width + job.tile - 1) / job.tile;
     int listed = disti_render_list(&tracer, &view, &job);
     job.count = listed ? listed : job.across * ((view.height + job.tile - 1) / job.tile);
     disti_sphere_box(&view, field, job.box);

@@ -10588,8 +10588,8 @@ static void disti_normal_gradient(const disti_tracer *tracer, int worker, const 
 
 /* The tile's next hits from ray *i on, at most DISTI_GRADIENTS: their points and, in bench->index, which rays. known 0:
    but those whose gradient is known. */
-static size_t disti_render_hits(const disti_render_job *job, const disti_tile *tile, const disti_bench *bench, int known,
-                                int *i, float *points)
+static size_t disti_render_hits(const disti_render_job *job, const disti_tile *tile, const disti_bench *bench,
+                                int known, int *i, float *points)
 {
     size_t count = 0;
     for (; *i < tile->width * tile->height && count < DISTI_GRADIENTS; ++*i) {

@@ -11011,7 +11011,7 @@ static int disti_warm_hits(disti_warm *warm)
             if (pass == 0 ? (x | y) & 7 : disti_warm_asks(warm, x, y) == (pass == 2)) continue;
             size_t pixel = disti_warm_pixel(warm, i);
             float spread = 3e38f, wide = 3e38f, s = warm->tape->s[pixel], move = 0.0f;
-            if (!(warm->tape->value[pixel] < -0.04f * warm->tracer->lipschitz)) continue; /* as disti_warm_expects */
+            if (!(warm->tape->value[pixel] < -2e-3f * warm->tracer->lipschitz)) continue; /* as disti_warm_expects */
             for (int slopes = 0; slopes < 2 && pass > 0; slopes++) { /* the one by which the neighbors differ less */
                 float apart = 3e38f, *least = &spread, other = 3e38f;
                 if (pass == 2) other = disti_warm_between(warm, warm->moved, slopes, i, &apart);

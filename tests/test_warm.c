@@ -282,6 +282,8 @@ TEST(trained_nets_of_the_test_data_do_not_drift_either)
     check_steps("bob_spot", 1, 5e-4f, 0, 40, 1.0);
     check_steps("bob_spot", 1, 4e-4f, 1, 40, 1.2);
     check_steps("bunny_relu", 0, 5e-4f, 0, 40, 1.2);
+    check_steps("rings", 0, 4e-4f, 0, 40, 1.35);
+    check_steps("mug_camera_bottle", 0, 4e-4f, 0, 40, 2.0);
 }
 
 TEST(a_warm_start_needs_its_tape)

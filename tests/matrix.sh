@@ -10,7 +10,7 @@ quick=
 [ "$1" = quick ] && quick=1 && shift
 only=$*
 
-sanitize="-O1 -g -fsanitize=address,undefined,float-cast-overflow -fno-sanitize-recover=all -fno-omit-frame-pointer"
+sanitize="-O1 -g1 -fsanitize=address,undefined,float-cast-overflow -fno-sanitize-recover=all -fno-omit-frame-pointer"
 passed=0 failed=0 skipped=0
 mkdir -p build/matrix
 
@@ -97,11 +97,11 @@ if [ -n "$quick" ]; then
     else
         skip_row sanitizers "$cc has no sanitizers here"
     fi
-    row fast_math build/matrix/fast_math $cc "-O2 -ffast-math" "" 1 ""
     # What does not optimize is slow: there the parts that depend on the compiler, inline functions and scratch.
     row O0 build/matrix/O0 $cc "-O0" "" 1 "" test_kernels test_half test_net test_context test_render test_workspace
-    # What depends on the instruction set.
+    # What depends on the instruction set, and on the order of sums.
     set -- test_kernels test_half test_net test_color test_second test_weights test_render test_trace test_stability
+    row fast_math build/matrix/fast_math $cc "-O2 -ffast-math" "" 1 "" "$@" test_gradients test_scene test_camera
     isa_row scalar build $cc "-O2" scalar 1 "$@"
     isa_row avx2 build $cc "-O2" avx2 1 "$@" test_gradients test_warm
 else

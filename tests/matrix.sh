@@ -135,7 +135,7 @@ fi
 if have aarch64-linux-gnu-gcc && have qemu-aarch64; then
     # All of it takes an emulator too long for every change.
     row aarch64 build/matrix/aarch64 aarch64-linux-gnu-gcc "-O2 -static" "" 1 qemu-aarch64 \
-        ${quick:+test_kernels test_net test_outline}
+        ${quick:+test_kernels test_outline test_camera}
     [ -n "$quick" ] || row aarch64_scalar build/matrix/aarch64 aarch64-linux-gnu-gcc "-O2 -static" scalar 1 qemu-aarch64
 else
     skip_row aarch64 "aarch64-linux-gnu-gcc and qemu-aarch64 are not both installed"

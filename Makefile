@@ -81,11 +81,11 @@ demo: build/fit_depth
 bench: $(filter-out $(RESULTS),$(BENCHES))
 	@$(BENCH_COMMAND)
 
-results: $(RESULTS) build/bench_needs build/bench_work_precision
+results: $(RESULTS) build/bench_needs build/bench_step build/bench_work_precision
 	@sh bench/results.sh bench/results $(RESULTS)
 	@sh bench/readme.sh
 
-results-quick: $(RESULTS) build/bench_needs build/bench_work_precision
+results-quick: $(RESULTS) build/bench_needs build/bench_step build/bench_work_precision
 	@sh bench/results.sh --quick build/results $(RESULTS)
 
 test-programs: $(TESTS)

@@ -64,6 +64,25 @@ csv code_size sh bench/code_size.sh $quick
                   print line } }' "$folder/code_size.csv"
 } | section code_size "Bytes of code, by what is left out" "sh bench/code_size.sh"
 
+# The same step in PyTorch, where a python3 has it; else what is in FOLDER already stays.
+for python in python3 /usr/bin/python3 ""; do
+    [ -z "$python" ] || ! "$python" -c "import torch" 2>/dev/null || break
+done
+if [ -n "$python" ]; then
+    csv pytorch "$python" bench/pytorch.py ${quick:+--case embedded --size 64} --steps 3
+    {
+        echo "A step of an optimization (a picture with silhouette, losses, gradient for the code, Adam), in PyTorch with the"
+        echo "paper's tracer and in dist.h with its own, on the same processor with the same threads in one run;"
+        echo "bench/pytorch.py says what was done to PyTorch's advantage. times: of dist.h's cold step."
+        echo
+        awk -F , '/^#/ { if (/PyTorch/) print substr($0, 3) ".\n"; next }
+            !n++ { print "| case | method | device | seconds | times | forward | backward | queries | hits |"
+                   print "|---|---|---|---|---|---|---|---|---|"; next }
+            { print "| " $1 ", " $4 " pixels | " $2 " | " $3 " | " $6 " | " $11 " | " $7 " | " $8 " | " $9 " | " $10 " |" }' \
+            "$folder/pytorch.csv"
+    } | section pytorch "The same step in PyTorch" "python3 bench/pytorch.py"
+fi
+
 # Every scene at one size here; build/bench_work_precision --long does all of them. Plots of some: each is 0.2 MB.
 mkdir -p build/work_precision || exit 1
 if [ -n "$quick" ]; then
@@ -113,7 +132,7 @@ guarded_bf16" '
         [ -e "$folder/work_precision_$name.svg" ] && printf '\n![%s](work_precision_%s.svg)\n' "$name" "$name"
     done
 } | section work_precision "Error against cost" "build/bench_work_precision"
-rm -f "$folder/needs.txt" "$folder/code_size.txt"
+rm -f "$folder/needs.txt" "$folder/code_size.txt" "$folder/pytorch.txt"
 
 {
     echo "# RESULTS"
@@ -121,7 +140,7 @@ rm -f "$folder/needs.txt" "$folder/code_size.txt"
     echo "Made by \`make results${quick:+-quick}\`; each section names its own command, the machine and the commit."
     echo "Published numbers are of other shapes, decoders and machines."
     # The tracer first, then what is fitted with it.
-    first="ladder marching threshold work_precision needs code_size"
+    first="pytorch ladder marching threshold work_precision needs code_size"
     for name in $first; do [ -e "$folder/$name.md" ] && echo && cat "$folder/$name.md"; done
     for file in "$folder"/*.md; do
         name=$(basename "$file" .md)

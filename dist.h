@@ -973,6 +973,7 @@ struct dist_context {
     int isa;
     dist_status status;
     char message[400];
+    const char *path;       /* of the file that is being read or written, for the sentence */
     unsigned char *scratch; /* workers * DISTI_SCRATCH_BYTES: counters, then the tracer's part */
     unsigned char *lanes;   /* workers * lane_bytes: the field's part; grown by create functions only */
     size_t lane_bytes;      /* of each worker, a multiple of DISTI_ALIGNMENT */
@@ -1052,8 +1053,16 @@ static size_t disti_format_number(char *out, double x, int digits)
     return n;
 }
 
+/* Appends text, as long as 64 bytes stay free. Unprintable bytes become '?': it may come out of a hostile file. */
+static size_t disti_fail_text(char *out, size_t n, size_t size, const char *text)
+{
+    for (const char *t = text ? text : "(null)"; *t && n + 64 < size; t++)
+        out[n++] = *t >= ' ' && *t <= '~' ? *t : '?';
+    return n;
+}
+
 /* Keeps the sentence of the first failure and returns status. In format %s stands for text, the first and second %d
-   for a and b; what is too long is cut. Unprintable bytes of text become '?': it may come out of a hostile file. */
+   for a and b; what is too long is cut. The file's path, if there is one, comes last. */
 static dist_status disti_fail(dist_context *ctx, dist_status status, const char *format, const char *text, double a,
                               double b)
 {
@@ -1063,8 +1072,7 @@ static dist_status disti_fail(dist_context *ctx, dist_status status, const char 
     int used = 0;
     for (const char *c = format; *c && n + 64 < sizeof message; c++) {
         if (c[0] == '%' && c[1] == 's') {
-            for (const char *t = text ? text : "(null)"; *t && n + 64 < sizeof message; t++)
-                message[n++] = *t >= ' ' && *t <= '~' ? *t : '?';
+            n = disti_fail_text(message, n, sizeof message, text);
             c++;
         } else if (c[0] == '%' && c[1] == 'd') {
             n += disti_format_number(message + n, used++ ? b : a, 6);
@@ -1072,6 +1080,12 @@ static dist_status disti_fail(dist_context *ctx, dist_status status, const char 
         } else {
             message[n++] = *c;
         }
+    }
+    if (ctx->path) {
+        message[n++] = ' ';
+        message[n++] = '(';
+        n = disti_fail_text(message, n, sizeof message, ctx->path);
+        message[n++] = ')';
     }
     message[n] = 0;
     if (ctx->status == DIST_OK) {
@@ -7679,16 +7693,18 @@ DIST_API dist_status dist_net_save(dist_context *ctx, const dist_net *net, void 
 static unsigned char *disti_file_read(dist_context *ctx, const char *function, const char *path, size_t *size)
 {
     *size = 0;
+    ctx->path = path;
     FILE *file = path ? fopen(path, "rb") : NULL;
     long end = file && fseek(file, 0, SEEK_END) == 0 ? ftell(file) : -1;
     int good = end >= 0 && end <= 0x7ffffff0L && fseek(file, 0, SEEK_SET) == 0;
     unsigned char *bytes = good ? (unsigned char *)disti_alloc(ctx, (size_t)end) : NULL;
     size_t got = bytes ? fread(bytes, 1, (size_t)end, file) : 0;
     if (!path) disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: path is NULL", function, 0, 0);
-    else if (!file) disti_fail(ctx, DIST_IO, "%s: cannot be opened", path, 0, 0);
-    else if (!good) disti_fail(ctx, DIST_IO, "%s: is not a file that can be read whole", path, 0, 0);
+    else if (!file) disti_fail(ctx, DIST_IO, "%s: the file cannot be opened", function, 0, 0);
+    else if (!good) disti_fail(ctx, DIST_IO, "%s: not a file that can be read whole", function, 0, 0);
     else if (bytes && got != (size_t)end)
-        disti_fail(ctx, DIST_IO, "%s: reading failed after %d of %d bytes", path, (double)got, (double)end);
+        disti_fail(ctx, DIST_IO, "%s: reading failed after %d of %d bytes", function, (double)got, (double)end);
+    ctx->path = NULL;
     if (file) fclose(file);
     if (bytes && got == (size_t)end) *size = got;
     else if (bytes) disti_free(ctx, bytes, (size_t)end);
@@ -7696,19 +7712,22 @@ static unsigned char *disti_file_read(dist_context *ctx, const char *function, c
 }
 
 /* Writes and gives back bytes, which disti_alloc returned, unless status says that they were not made. */
-static dist_status disti_file_write(dist_context *ctx, const char *path, void *bytes, size_t size, dist_status status)
+static dist_status disti_file_write(dist_context *ctx, const char *function, const char *path, void *bytes,
+                                    size_t size, dist_status status)
 {
     if (!bytes) return DIST_OUT_OF_MEMORY;
+    ctx->path = path;
     if (status == DIST_OK) {
         FILE *file = path ? fopen(path, "wb") : NULL;
         size_t put = file ? fwrite(bytes, 1, size, file) : 0;
         int closed = file ? fclose(file) : 0;
-        if (!path) status = disti_fail(ctx, DIST_BAD_ARGUMENT, "path is NULL, must name a file to write", NULL, 0, 0);
-        else if (!file) status = disti_fail(ctx, DIST_IO, "%s: cannot be opened for writing", path, 0, 0);
+        if (!path) status = disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: path is NULL", function, 0, 0);
+        else if (!file) status = disti_fail(ctx, DIST_IO, "%s: the file cannot be opened for writing", function, 0, 0);
         else if (put != size || closed != 0)
-            status = disti_fail(ctx, DIST_IO, "%s: writing failed after %d of %d bytes", path, (double)put,
+            status = disti_fail(ctx, DIST_IO, "%s: writing failed after %d of %d bytes", function, (double)put,
                                 (double)size);
     }
+    ctx->path = NULL;
     disti_free(ctx, bytes, size);
     return status;
 }
@@ -7718,7 +7737,9 @@ DIST_API dist_net *dist_net_load_file(dist_context *ctx, const char *path)
     size_t size;
     if (disti_enter(ctx) != DIST_OK) return NULL;
     unsigned char *bytes = disti_file_read(ctx, "dist_net_load_file", path, &size);
+    ctx->path = path;
     dist_net *net = bytes ? dist_net_load(ctx, bytes, size) : NULL;
+    ctx->path = NULL;
     disti_free(ctx, bytes, size);
     return net;
 }
@@ -7730,7 +7751,7 @@ DIST_API dist_status dist_net_save_file(dist_context *ctx, const dist_net *net, 
     if (status != DIST_OK) return status;
     void *bytes = disti_alloc(ctx, size);
     if (bytes) status = dist_net_save(ctx, net, bytes, size, &size);
-    return disti_file_write(ctx, path, bytes, size, status);
+    return disti_file_write(ctx, "dist_net_save_file", path, bytes, size, status);
 }
 #endif
 
@@ -9233,8 +9254,8 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_trace: origins, directions or hits is NULL", NULL, 0, 0);
     if (tracer.how.pixels)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_trace: how.pixels is for pictures, must be NULL", NULL, 0, 0);
-    if (n > (size_t)1 << 40)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_trace: n is %d, at most 2^40", NULL, (double)n, 0);
+    if (n >> 20 >> 20 > 0) /* a size_t of 32 bits cannot be shifted by 40 */
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_trace: n is %d, must be below 2^40", NULL, (double)n, 0);
     disti_stats_begin(ctx);
     disti_free_job job = {&tracer, n, origins, directions, hits};
     disti_run(ctx, (int)((n + DISTI_FREE_RAYS - 1) / DISTI_FREE_RAYS), disti_free_task, &job);
@@ -9260,12 +9281,19 @@ typedef struct disti_foot {
 
 enum { DISTI_FEET = 512, DISTI_FOOT_STEPS = 96 };
 
+/* Of a way to a point as far off as a float can say, whose square it cannot. */
+static float disti_foot_length(const float d[3])
+{
+    double x = (double)d[0], y = (double)d[1], z = (double)d[2], length = sqrt(x * x + y * y + z * z);
+    return (float)DISTI_MIN(length, 3e38);
+}
+
 /* Moves x by `step` times n and keeps it in the bounding sphere. Returns how far out it would have been. */
 static float disti_foot_move(const dist_field *field, float *x, const float *n, float step)
 {
     const float *c = field->center;
     for (int i = 0; i < 3; i++) x[i] += step * n[i];
-    float length = disti_length(x[0] - c[0], x[1] - c[1], x[2] - c[2]);
+    float d[3] = {x[0] - c[0], x[1] - c[1], x[2] - c[2]}, length = disti_foot_length(d);
     for (int i = 0; i < 3 && length > field->radius; i++) x[i] = c[i] + (x[i] - c[i]) / length * field->radius;
     return DISTI_MAX(length - field->radius, 0.0f);
 }
@@ -9275,7 +9303,7 @@ static int disti_foot_arrive(const dist_field *field, disti_foot *foot, const fl
 {
     float d[3], r = field->radius, reach = field->clamp > 0.0f ? 0.5f * field->clamp : 2.0f * r;
     for (int i = 0; i < 3; i++) d[i] = foot->p[i] - foot->x[i];
-    float distance = disti_length(d[0], d[1], d[2]), gain = foot->distance - distance;
+    float distance = disti_foot_length(d), gain = foot->distance - distance;
     foot->status = DIST_RAY_HIT;
     if (gain > 0.0f) {
         memcpy(foot->best, foot->x, sizeof foot->best);
@@ -9309,10 +9337,11 @@ static int disti_foot_advance(const dist_field *field, disti_foot *foot, float f
     }
     if (foot->steps++ == 0) {
         float least = f > 0.0f || foot->away <= 0.0f ? size / lipschitz : 0.0f;
-        least = sqrtf(foot->away * foot->away + least * least);
+        const float way[3] = {foot->away, least, 0.0f};
+        least = disti_foot_length(way);
         foot->sign = f < 0.0f && foot->away <= 0.0f ? -1.0f : 1.0f;
         foot->least = least;
-        if (foot->sign > 0.0f && least >= foot->radius) {
+        if (foot->sign > 0.0f && foot->radius < 3e38f && least >= foot->radius) {
             foot->status = DIST_RAY_MISS;
             foot->distance = least;
             return 0;
@@ -9359,7 +9388,7 @@ static void disti_foot_task(void *arg, int index, int worker)
         foot->status = DIST_RAY_NOT_FINITE;
         if (!disti_finite_all(job->stride, p)) continue;
         foot->away = disti_foot_move(field, foot->x, zero, 0.0f);
-        foot->status = foot->away >= foot->radius ? DIST_RAY_MISS : DIST_RAY_UNRESOLVED;
+        foot->status = job->contacts && foot->away >= foot->radius ? DIST_RAY_MISS : DIST_RAY_UNRESOLVED;
         if (foot->status == DIST_RAY_MISS) foot->distance = foot->away;
         else bench.index[active++] = (int)i;
     }
@@ -9377,7 +9406,7 @@ static void disti_foot_task(void *arg, int index, int worker)
         disti_foot *foot = &feet[i];
         float d[3] = {foot->p[0] - foot->x[0], foot->p[1] - foot->x[1], foot->p[2] - foot->x[2]};
         if (foot->status != DIST_RAY_HIT) memcpy(foot->best, foot->x, sizeof foot->best);
-        if (foot->status == DIST_RAY_UNRESOLVED) foot->distance = disti_length(d[0], d[1], d[2]);
+        if (foot->status == DIST_RAY_UNRESOLVED) foot->distance = disti_foot_length(d);
         if (job->contacts) {
             dist_contact *contact = &job->contacts[first + i];
             contact->depth = foot->radius - foot->sign * foot->distance;
@@ -9403,8 +9432,8 @@ static dist_status disti_foot_run(disti_foot_job *job, const char *function, con
     if (status != DIST_OK) return status;
     if (job->n > 0 && (!job->points || !out))
         return disti_fail(job->ctx, DIST_BAD_ARGUMENT, "%s: what is asked or what is answered is NULL", function, 0, 0);
-    if (job->n > (size_t)1 << 39)
-        return disti_fail(job->ctx, DIST_BAD_ARGUMENT, "%s: n is %d, at most 2^39", function, (double)job->n, 0);
+    if (job->n >> 20 >> 19 > 0)
+        return disti_fail(job->ctx, DIST_BAD_ARGUMENT, "%s: n is %d, must be below 2^39", function, (double)job->n, 0);
     disti_run(job->ctx, (int)((job->n + DISTI_FEET - 1) / DISTI_FEET), disti_foot_task, job);
     return DIST_OK;
 }
@@ -12752,6 +12781,11 @@ DIST_API dist_mesh *dist_mesh_create(dist_context *ctx, size_t vertex_count, con
                    vertex_count && !vertices ? "vertices" : "triangles", 0, 0);
         return NULL;
     }
+    if (vertex_count > 0xfffffffeu || triangle_count > (size_t)-1 / (3 * sizeof(unsigned))) {
+        disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_create: %d vertices and %d triangles are more than there can be",
+                   NULL, (double)vertex_count, (double)triangle_count);
+        return NULL;
+    }
     dist_mesh *mesh = disti_mesh_new(ctx);
     int good = mesh != NULL;
     for (size_t i = 0; good && i < vertex_count; i++) {
@@ -13656,7 +13690,7 @@ DIST_API dist_status dist_pfm_save(dist_context *ctx, const char *path, int widt
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_pfm_save: %s is NULL", path ? "pixels" : "path", 0, 0);
     void *bytes = disti_alloc(ctx, size);
     if (bytes) status = dist_pfm_write(ctx, width, height, channels, pixels, bytes, size, &size);
-    return disti_file_write(ctx, path, bytes, size, status);
+    return disti_file_write(ctx, "dist_pfm_save", path, bytes, size, status);
 }
 
 DIST_API float *dist_pfm_load(dist_context *ctx, const char *path, int *width, int *height, int *channels)
@@ -14143,7 +14177,7 @@ DIST_API dist_status dist_mesh_save(dist_context *ctx, const dist_mesh *mesh, co
     if (status != DIST_OK) return status;
     void *bytes = disti_alloc(ctx, size);
     if (bytes) status = dist_mesh_write(ctx, mesh, format, bytes, size, &size);
-    return disti_file_write(ctx, path, bytes, size, status);
+    return disti_file_write(ctx, "dist_mesh_save", path, bytes, size, status);
 }
 #endif
 #endif

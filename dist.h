@@ -391,12 +391,12 @@ typedef struct dist_net_desc {
     int code_size;    /* 0: none */
     int code_count;   /* codes stored beside the weights, zero at first */
     int activation;   /* DIST_ACTIVATION_* */
-    float scale;      /* beta of softplus, omega of sine; 0: 100, 30 */
+    float scale;      /* beta of softplus, omega of sine, 1e-6 to 1e6; 0: 100, 30 */
     int output_linear;/* 0: tanh at the end, 1: nothing */
     int levels;       /* Fourier levels beside the point: sin and cos of pi 2^k p, k below levels; at most 16 */
     int color;        /* 1: a texture: r, g, b in place of the distance, with a sigmoid at the end unless linear */
     int geometric; /* 1: starts near the distance to a sphere of half the bound (ReLU, softplus); 0: PyTorch's start */
-    float bound;      /* 0: 1 */
+    float bound;      /* radius of the sphere that holds the shape, 1e-6 to 1e6; 0: 1 */
     float clamp;      /* 0: 0.1 with a code, none without */
     unsigned seed;
 } dist_net_desc;
@@ -7805,11 +7805,14 @@ static dist_status disti_net_desc_check(dist_context *ctx, const dist_net_desc *
         {"activation", (double)d->activation, 0, DIST_ACTIVATION_NONE}};
     dist_status status = disti_limits(ctx, name, sizeof limits / sizeof limits[0], limits);
     if (status != DIST_OK) return status;
-    if (!disti_finite(d->scale) || d->scale <= 0.0f || !disti_finite(d->bound) || d->bound <= 0.0f ||
-        !disti_finite(d->clamp) || d->clamp < 0.0f)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT,
-                          "%s: scale is %d, bound %d; both, and clamp, must be finite and not negative", name,
-                          (double)d->scale, (double)d->bound);
+    const float value[3] = {d->scale, d->bound, d->clamp};
+    for (int i = 0; i < 3; i++) /* what a file may say */
+        if (!disti_finite(value[i]) || value[i] < (i < 2 ? 1e-6f : 0.0f) || value[i] > 1e6f)
+            return disti_fail(ctx, DIST_BAD_ARGUMENT,
+                              i == 0   ? "dist_net_create: scale is %d, must be 1e-6 to 1e6, or 0"
+                              : i == 1 ? "dist_net_create: bound is %d, must be 1e-6 to 1e6, or 0"
+                                       : "dist_net_create: clamp is %d, must be 0 to 1e6",
+                              NULL, (double)value[i], 0);
     return DIST_OK;
 }
 
@@ -9174,6 +9177,15 @@ static void disti_stats_end(dist_context *ctx, const disti_tracer *tracer, dist_
     out->lipschitz = tracer->lipschitz;
 }
 
+/* What is told of the error: the distance goes out as a float, which rounds off up to 2^-24 of it. */
+static float disti_ray_bound(const disti_tracer *tracer, const disti_ray *ray)
+{
+    double distance = ray->base + (double)ray->best;
+    if (tracer->how.trace == DIST_TRACE_PAPER) return ray->error; /* |f|, no bound */
+    if (ray->status != DIST_RAY_HIT && ray->status != DIST_RAY_UNRESOLVED) return ray->error;
+    return (float)((double)ray->error + 6e-8 * fabs(distance));
+}
+
 static void disti_stats_ray(const disti_tracer *tracer, const disti_ray *ray, dist_stats *stats)
 {
     if (ray->status == DIST_RAY_SKIPPED) return;
@@ -9186,7 +9198,8 @@ static void disti_stats_ray(const disti_tracer *tracer, const disti_ray *ray, di
     stats->not_finite += ray->status == DIST_RAY_NOT_FINITE;
     if (ray->status != DIST_RAY_HIT) return;
     float epsilon = disti_ray_epsilon(tracer, ray, ray->best);
-    if (ray->error > stats->error) stats->error = ray->error;
+    float error = disti_ray_bound(tracer, ray);
+    if (error > stats->error) stats->error = error;
     stats->epsilon = stats->epsilon > 0.0f ? DISTI_MIN(stats->epsilon, epsilon) : epsilon;
 }
 
@@ -9236,7 +9249,7 @@ static void disti_free_task(void *arg, int index, int worker)
         dist_hit *hit = job->hits + first + i;
         disti_stats_ray(job->tracer, ray, bench.stats);
         hit->distance = (float)(ray->base + (double)ray->best);
-        hit->error = ray->error;
+        hit->error = disti_ray_bound(job->tracer, ray);
         hit->sdf = ray->fbest;
         hit->status = ray->status;
     }
@@ -10718,7 +10731,7 @@ static void disti_render_pixel(const disti_render_job *job, const disti_ray *ray
     if (out->silhouette) out->silhouette[pixel] = skipped ? 0.0f : disti_ray_silhouette(tracer, ray);
     if (out->mask) out->mask[pixel] = (unsigned char)hit;
     if (out->status) out->status[pixel] = ray->status;
-    if (out->error) out->error[pixel] = placed ? ray->error : 0.0f;
+    if (out->error) out->error[pixel] = placed ? disti_ray_bound(tracer, ray) : 0.0f;
     if (out->normal) out->normal[3 * pixel] = out->normal[3 * pixel + 1] = out->normal[3 * pixel + 2] = 0.0f;
     if (out->color) memcpy(out->color + 3 * pixel, tracer->how.background_color, 3 * sizeof(float));
     if (!job->tape) return;

@@ -531,6 +531,21 @@ TEST(folders_empty_and_missing_files_are_sentences_with_the_path)
     CHECK_TEXT("test_files_empty.obj", dist_context_message(ctx));
     dist_context_clear(ctx);
     remove(path);
+    CHECK(!dist_net_load_file(ctx, path));
+    CHECK_TEXT("dist_net_load_file: the file cannot be opened (", dist_context_message(ctx));
+    CHECK_TEXT("test_files_empty.obj)", dist_context_message(ctx));
+    dist_context_clear(ctx);
+    CHECK(!dist_net_load_file(ctx, "dist.h")); /* what is wrong inside is told with the path, too */
+    CHECK_TEXT("dist_net_load: the file has a header length", dist_context_message(ctx));
+    CHECK_TEXT("(dist.h)", dist_context_message(ctx));
+    dist_context_clear(ctx);
+    CHECK(!dist_net_load(ctx, "rubbish", 7)); /* and not where there is none */
+    CHECK(!strstr(dist_context_message(ctx), "dist.h"));
+    dist_context_clear(ctx);
+    const float pixel = 1.0f;
+    CHECK_STATUS(DIST_IO, dist_pfm_save(ctx, "tests", 1, 1, 1, &pixel), ctx);
+    CHECK_TEXT("dist_pfm_save: the file cannot be opened for writing (tests)", dist_context_message(ctx));
+    dist_context_clear(ctx);
     CHECK(!dist_mesh_load(ctx, "tests"));
     CHECK_STATUS(DIST_IO, dist_context_status(ctx), ctx);
     CHECK_TEXT("tests", dist_context_message(ctx));

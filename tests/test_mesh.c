@@ -558,6 +558,13 @@ TEST(a_mesh_of_ones_own_is_checked)
     CHECK(!dist_mesh_create(ctx, 2, vertices, 1, triangles));
     CHECK_TEXT("vertex 2", dist_context_message(ctx));
     dist_context_clear(ctx);
+    /* more than there can be: said before anything is read */
+    CHECK(!dist_mesh_create(ctx, (size_t)-1, vertices, 1, triangles));
+    CHECK_TEXT("more than there can be", dist_context_message(ctx));
+    dist_context_clear(ctx);
+    CHECK(!dist_mesh_create(ctx, 3, vertices, (size_t)-1 / 2, triangles));
+    CHECK_TEXT("3 vertices and", dist_context_message(ctx));
+    dist_context_clear(ctx);
     uint32_t bits = 0x7f800000u;
     memcpy(vertices + 4, &bits, sizeof bits);
     CHECK(!dist_mesh_create(ctx, 3, vertices, 1, triangles));

@@ -579,7 +579,7 @@ TEST(a_net_made_has_the_form_asked_for)
 
 TEST(a_net_that_cannot_be_made_is_refused)
 {
-    for (int k = 0; k < 9; k++) {
+    for (int k = 0; k < 12; k++) {
         dist_context *ctx = test_context();
         dist_net_desc d = small_desc();
         switch (k) {
@@ -591,11 +591,15 @@ TEST(a_net_that_cannot_be_made_is_refused)
         case 5: d.activation = 6; break;
         case 6: d.scale = -1.0f; break;
         case 7: d.bound = -1.0f; break;
+        case 8: d.bound = 1.1e6f; break; /* what a file may not say: it could be saved, but not loaded */
+        case 9: d.scale = 1.1e6f; break;
+        case 10: d.clamp = 1.1e6f; break;
         default: d.layers = -1; break;
         }
         CHECK(dist_net_create(ctx, &d) == NULL);
         CHECK_STATUS(DIST_BAD_ARGUMENT, dist_context_status(ctx), ctx);
         CHECK_TEXT("dist_net_create: ", dist_context_message(ctx));
+        if (k == 10) CHECK_TEXT("clamp is 1100000, must be 0 to 1e6", dist_context_message(ctx));
         dist_context_destroy(ctx);
     }
 }

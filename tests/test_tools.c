@@ -460,6 +460,28 @@ TEST(what_has_no_answer_says_so)
     dist_context_destroy(ctx);
 }
 
+/* Squares of these lengths do not fit a float. */
+TEST(points_far_beyond_the_sphere_have_a_nearest_point)
+{
+    dist_context *ctx = shape_context();
+    test_shape shape = shape_make(SHAPE_SPHERE, 0.6, 0, 0, 0);
+    dist_field field = shape_field(&shape, 1, 1);
+    float p[6] = {1e30f, 0, 0, 0, -1e20f, 0}, spheres[8] = {1e30f, 0, 0, 1, 0, 1e20f, 0, 2e20f};
+    CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &field, 2, p, closest, distance, status), ctx);
+    for (int i = 0; i < 2; i++) CHECK_EQUAL(DIST_RAY_HIT, status[i]);
+    CHECK_NEAR(0.6, closest[0], 1e-5);
+    CHECK_NEAR(-0.6, closest[4], 1e-5);
+    CHECK_NEAR(1e30, distance[0], 1e24);
+    CHECK_NEAR(1e20, distance[1], 1e14);
+    CHECK_STATUS(DIST_OK, dist_field_collide(ctx, &field, 2, spheres, contacts), ctx);
+    CHECK_EQUAL(DIST_RAY_MISS, contacts[0].status);
+    CHECK_NEAR(-1e30, contacts[0].depth, 1e24);
+    CHECK_EQUAL(DIST_RAY_HIT, contacts[1].status);
+    CHECK_NEAR(1e20, contacts[1].depth, 1e14);
+    CHECK_NEAR(1.0, contacts[1].normal[1], 1e-6);
+    dist_context_destroy(ctx);
+}
+
 TEST(many_points_are_the_same_as_single_ones)
 {
     enum { N = 1300 };
@@ -496,6 +518,7 @@ int main(int argc, char **argv)
     RUN(spheres_that_are_clear_cost_one_query_or_none);
     RUN(spheres_touch_the_instance_that_is_there);
     RUN(what_has_no_answer_says_so);
+    RUN(points_far_beyond_the_sphere_have_a_nearest_point);
     RUN(many_points_are_the_same_as_single_ones);
     return test_report();
 }

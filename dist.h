@@ -1096,6 +1096,12 @@ static dist_status disti_fail(dist_context *ctx, dist_status status, const char 
     return status;
 }
 
+/* disti_fail for an argument, by a sentence without numbers. */
+static dist_status disti_refuse(dist_context *ctx, const char *format, const char *text)
+{
+    return disti_fail(ctx, DIST_BAD_ARGUMENT, format, text, 0, 0);
+}
+
 /* A parameter with its range: low, 0 or 1, to high, which means none above 1e38. */
 typedef struct disti_limit {
     char name[24];
@@ -1331,7 +1337,7 @@ static dist_status disti_lanes_reserve(dist_context *ctx, size_t bytes)
     if (bytes <= ctx->lane_bytes) return DIST_OK;
     disti_size_add(bytes, DISTI_ALIGNMENT - 1, &each);
     each &= ~(size_t)(DISTI_ALIGNMENT - 1);
-    if (!disti_size_mul(each, (size_t)ctx->workers, &total)) total = (size_t)-1;
+    disti_size_mul(each, (size_t)ctx->workers, &total);
     unsigned char *lanes = (unsigned char *)disti_alloc(ctx, total);
     if (!lanes) return DIST_OUT_OF_MEMORY;
     disti_free(ctx, ctx->lanes, ctx->lane_bytes * (size_t)ctx->workers);
@@ -1384,7 +1390,7 @@ static dist_status disti_partial_reserve(dist_context *ctx, size_t size)
 {
     size_t bytes;
     if (size <= ctx->partial_size) return DIST_OK;
-    if (!disti_size_mul(size, DISTI_SLOTS * sizeof(double), &bytes)) bytes = (size_t)-1;
+    disti_size_mul(size, DISTI_SLOTS * sizeof(double), &bytes);
     double *partial = (double *)disti_alloc(ctx, bytes);
     if (!partial) return DIST_OUT_OF_MEMORY;
     disti_free(ctx, ctx->partial, ctx->partial_size * DISTI_SLOTS * sizeof(double));
@@ -1397,7 +1403,7 @@ static dist_status disti_partial_reserve(dist_context *ctx, size_t size)
 static dist_status disti_partial_for(dist_context *ctx, size_t codes)
 {
     size_t size;
-    if (!disti_size_add(codes, codes / DISTI_SLOTS + 1, &size)) size = (size_t)-1;
+    disti_size_add(codes, codes / DISTI_SLOTS + 1, &size);
     return disti_partial_reserve(ctx, size);
 }
 
@@ -1406,7 +1412,7 @@ static dist_status disti_store_reserve(dist_context *ctx, size_t size)
 {
     size_t bytes;
     if (size <= ctx->store_size) return DIST_OK;
-    if (!disti_size_mul(size, sizeof(float), &bytes)) bytes = (size_t)-1;
+    disti_size_mul(size, sizeof(float), &bytes);
     float *store = (float *)disti_alloc(ctx, bytes);
     if (!store) return DIST_OUT_OF_MEMORY;
     disti_free(ctx, ctx->store, ctx->store_size * sizeof(float));
@@ -1455,7 +1461,7 @@ static dist_status disti_context_check(dist_context *ctx, const dist_context_des
         return disti_fail(ctx, DIST_UNSUPPORTED, "dist_context_create: this processor or this build has no %s",
                           dist_isa_name(desc->isa), 0, 0);
     if (desc->scheduler.run_fn && desc->workers == 0)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: workers is 0, must be told with a scheduler", name, 0, 0);
+        return disti_refuse(ctx, "%s: workers is 0, must be told with a scheduler", name);
     if (desc->blas_width < 0)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: blas_width is %d, must not be negative", name, desc->blas_width,
                           0);
@@ -1486,7 +1492,7 @@ static dist_status disti_context_begin(dist_context *ctx, const dist_context_des
     if (!ctx->scheduler.run_fn) ctx->workers = 1;
 #endif
     size_t total;
-    if (!disti_size_mul(DISTI_SCRATCH_BYTES, (size_t)ctx->workers, &total)) total = (size_t)-1;
+    disti_size_mul(DISTI_SCRATCH_BYTES, (size_t)ctx->workers, &total);
     ctx->scratch = (unsigned char *)disti_alloc(ctx, total);
     return ctx->scratch ? DIST_OK : DIST_OUT_OF_MEMORY;
 }
@@ -3152,11 +3158,10 @@ DISTI_ANALYTIC(box, 6, disti_length(c[3], c[4], c[5]))
 /* What makes a field unusable, for every function that takes one. */
 static dist_status disti_field_check(dist_context *ctx, const dist_field *field, const char *function)
 {
-    if (!field) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field is NULL", function, 0, 0);
+    if (!field) return disti_refuse(ctx, "%s: field is NULL", function);
     if (!field->eval_fn)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT,
-                          "%s: field.eval_fn is NULL (a failed create, or a net without a distance channel)", function,
-                          0, 0);
+        return disti_refuse(ctx, "%s: field.eval_fn is NULL (a failed create, or a net without a distance channel)",
+                            function);
     /* beyond these squares of lengths do not fit a float, and a surface would be missed without a word */
     if (!disti_finite_all(3, field->center) || !(field->radius >= DISTI_RADIUS_LEAST) ||
         !(field->radius <= DISTI_RADIUS_MOST))
@@ -3169,8 +3174,7 @@ static dist_status disti_field_check(dist_context *ctx, const dist_field *field,
         {"field.color_code_size", (double)field->color_code_size, 0, 3e38}};
     dist_status status = disti_limits(ctx, function, sizeof limits / sizeof limits[0], limits);
     if (status != DIST_OK) return status;
-    if (field->owner && field->owner != ctx)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field belongs to another context", function, 0, 0);
+    if (field->owner && field->owner != ctx) return disti_refuse(ctx, "%s: field belongs to another context", function);
     return DIST_OK;
 }
 
@@ -3223,8 +3227,7 @@ DIST_API dist_status dist_field_eval(dist_context *ctx, const dist_field *field,
     dist_status status = disti_enter(ctx);
     if (status == DIST_OK) status = disti_field_check(ctx, field, "dist_field_eval");
     if (status != DIST_OK || n == 0) return status;
-    if (!points || !sdf)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_field_eval: %s is NULL", points ? "sdf" : "points", 0, 0);
+    if (!points || !sdf) return disti_refuse(ctx, "dist_field_eval: %s is NULL", points ? "sdf" : "points");
     disti_field_eval_all(ctx, field, n, points, sdf, gradient);
     return DIST_OK;
 }
@@ -3259,15 +3262,14 @@ static void disti_color_task(void *arg, int index, int worker)
 /* What makes a field's color unusable; fields without a distance are welcome here. */
 static dist_status disti_color_check(dist_context *ctx, const dist_field *field, int adjoint, const char *function)
 {
-    if (!field) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field is NULL", function, 0, 0);
+    if (!field) return disti_refuse(ctx, "%s: field is NULL", function);
     if (adjoint ? !field->color_adjoint_fn : !field->color_fn)
         return disti_fail(ctx, DIST_UNSUPPORTED, adjoint ? "%s: the field's color has no adjoint"
                                                          : "%s: the field has no color", function, 0, 0);
     if (field->code_size < 0 || field->color_code_size < 0)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.code_size is %d, color_code_size %d, must not be negative",
                           function, field->code_size, field->color_code_size);
-    if (field->owner && field->owner != ctx)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field belongs to another context", function, 0, 0);
+    if (field->owner && field->owner != ctx) return disti_refuse(ctx, "%s: field belongs to another context", function);
     return DIST_OK;
 }
 
@@ -3277,8 +3279,7 @@ DIST_API dist_status dist_color_eval(dist_context *ctx, const dist_field *field,
     dist_status status = disti_enter(ctx);
     if (status == DIST_OK) status = disti_color_check(ctx, field, 0, "dist_color_eval");
     if (status != DIST_OK || n == 0) return status;
-    if (!points || !color)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_color_eval: %s is NULL", points ? "color" : "points", 0, 0);
+    if (!points || !color) return disti_refuse(ctx, "dist_color_eval: %s is NULL", points ? "color" : "points");
     disti_color_job job = {field, disti_cut(n, 8 * DISTI_BLOCK, 1u << 20), points, NULL, color, NULL, NULL, 0, 0};
     disti_run(ctx, job.pieces.count, disti_color_task, &job);
     return DIST_OK;
@@ -3448,16 +3449,14 @@ static dist_status disti_field_second(dist_context *ctx, const dist_field *field
 static dist_status disti_gradients_check(dist_context *ctx, const dist_field *field, const dist_gradients *grads,
                                          const char *function)
 {
-    if (!grads) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: grads is NULL", function, 0, 0);
+    if (!grads) return disti_refuse(ctx, "%s: grads is NULL", function);
     if (grads->code && (field->code_size == 0 || (!field->adjoint_fn && !field->fused_fn)))
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: grads.code is given, but the field has no code or no adjoint_fn",
-                          function, 0, 0);
+        return disti_refuse(ctx, "%s: grads.code is given, but the field has no code or no adjoint_fn", function);
     if (grads->weights && !field->weights_fn)
         return disti_fail(ctx, DIST_UNSUPPORTED, "%s: grads.weights is given, but the field has no weights_fn",
                           function, 0, 0);
     if (grads->color_code && (field->color_code_size <= 0 || !field->color_adjoint_fn))
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: grads.color_code is given, but the field has no color code",
-                          function, 0, 0);
+        return disti_refuse(ctx, "%s: grads.color_code is given, but the field has no color code", function);
     if (grads->color_weights && (field->color_weight_count == 0 || !field->color_weights_fn))
         return disti_fail(ctx, DIST_UNSUPPORTED, "%s: grads.color_weights is given, but the field has no texture",
                           function, 0, 0);
@@ -3477,22 +3476,20 @@ DIST_API dist_status dist_color_backward(dist_context *ctx, const dist_field *fi
     dist_gradients mine;
     dist_status status = disti_enter(ctx);
     if (status == DIST_OK) status = disti_color_check(ctx, field, 1, name);
-    if (status == DIST_OK && !grads) status = disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: grads is NULL", name, 0, 0);
+    if (status == DIST_OK && !grads) status = disti_refuse(ctx, "%s: grads is NULL", name);
     if (status != DIST_OK) return status;
     if (disti_gradients_camera(grads))
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: what grads holds of the camera must be NULL", name, 0, 0);
+        return disti_refuse(ctx, "%s: what grads holds of the camera must be NULL", name);
     if (grads->weights && (field->color_weight_count > 0 || !field->color_weights_fn))
         return disti_fail(ctx, DIST_UNSUPPORTED, "%s: grads.weights is given, but the color is not of the shape's net",
                           name, 0, 0);
     if (grads->code && field->code_size == 0)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: grads.code is given, but the field has no code", name, 0, 0);
+        return disti_refuse(ctx, "%s: grads.code is given, but the field has no code", name);
     mine = *grads;
     mine.code = mine.weights = NULL; /* a texture by itself has both, but no adjoint_fn, weights_fn of a distance */
     status = disti_gradients_check(ctx, field, &mine, name);
     if (status != DIST_OK || n == 0) return status;
-    if (!points || !d_color)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_color_backward: %s is NULL", points ? "d_color" : "points", 0,
-                          0);
+    if (!points || !d_color) return disti_refuse(ctx, "dist_color_backward: %s is NULL", points ? "d_color" : "points");
     size_t code = (size_t)field->code_size, size = code + (size_t)field->color_code_size;
     status = disti_partial_for(ctx, size);
     if (status != DIST_OK) return status;
@@ -3530,13 +3527,11 @@ DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *fi
     if (status == DIST_OK) status = disti_field_check(ctx, field, name);
     if (status == DIST_OK) status = disti_gradients_check(ctx, field, grads, name);
     if (status != DIST_OK || n == 0) return status;
-    if (!points) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: points is NULL", name, 0, 0);
+    if (!points) return disti_refuse(ctx, "%s: points is NULL", name);
     if (!d_sdf && (!seed_fn || grads->weights))
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: d_sdf is NULL, needed without seed_fn and for weights", name, 0,
-                          0);
+        return disti_refuse(ctx, "%s: d_sdf is NULL, needed without seed_fn and for weights", name);
     if (disti_gradients_camera(grads) || grads->color_code || grads->color_weights)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT,
-                          "%s: what grads holds of camera and color must be NULL: there is none here", name, 0, 0);
+        return disti_refuse(ctx, "%s: what grads holds of camera and color must be NULL: there is none here", name);
     double *d_code;
     status = disti_code_begin(ctx, field, grads, &d_code);
     if (status != DIST_OK) return status;
@@ -3561,12 +3556,11 @@ DIST_API dist_status dist_field_eikonal(dist_context *ctx, const dist_field *fie
     if (status == DIST_OK) status = disti_field_check(ctx, field, name);
     if (status == DIST_OK && grads) status = disti_gradients_check(ctx, field, grads, name);
     if (status != DIST_OK || n == 0) return status;
-    if (!points) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: points is NULL", name, 0, 0);
+    if (!points) return disti_refuse(ctx, "%s: points is NULL", name);
     if (!disti_finite(weight))
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: weight is %d, must be finite", name, (double)weight, 0);
     if (grads && (disti_gradients_camera(grads) || grads->color_code || grads->color_weights))
-        return disti_fail(ctx, DIST_BAD_ARGUMENT,
-                          "%s: what grads holds of camera and color must be NULL: there is none here", name, 0, 0);
+        return disti_refuse(ctx, "%s: what grads holds of camera and color must be NULL: there is none here", name);
     if (grads && !grads->code && !grads->weights) grads = NULL;
     if (grads) status = disti_code_begin(ctx, field, grads, &d_code);
     int exact = field->second_fn && (!grads || !grads->weights || field->second_weights_fn);
@@ -4079,10 +4073,8 @@ static dist_status disti_scene_place(dist_scene *scene, int k, const dist_instan
     if (!create && (!next.field.color_fn != !placed->field.color_fn ||
                     !next.field.color_adjoint_fn != !placed->field.color_adjoint_fn ||
                     next.field.color_code_size != placed->field.color_code_size))
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: what the instance has of color must stay what it was", function,
-                          0, 0);
-    if (disti_scene_within(scene, &next.field))
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: the field is this scene's own", function, 0, 0);
+        return disti_refuse(ctx, "%s: what the instance has of color must stay what it was", function);
+    if (disti_scene_within(scene, &next.field)) return disti_refuse(ctx, "%s: the field is this scene's own", function);
     if (!disti_finite(s->scale) || s->scale < 0.0f)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: placement.scale is %d, must be above 0 (0: 1)", function,
                           (double)s->scale, 0);
@@ -4150,7 +4142,7 @@ static dist_status disti_scene_take(dist_scene *scene)
     disti_scene_work w;
     size_t lanes, count = (size_t)scene->count;
     scene->scratch_bytes = disti_scene_layout(scene, NULL, &w);
-    if (!disti_size_mul(scene->scratch_bytes, (size_t)ctx->workers, &lanes)) lanes = (size_t)-1;
+    disti_size_mul(scene->scratch_bytes, (size_t)ctx->workers, &lanes);
     scene->placed = (disti_placed *)disti_alloc(ctx, count * sizeof(disti_placed));
     scene->ball = scene->placed ? (disti_ball *)disti_alloc(ctx, count * sizeof(disti_ball)) : NULL;
     scene->scratch = scene->ball ? (unsigned char *)disti_alloc(ctx, lanes) : NULL;
@@ -4182,7 +4174,7 @@ DIST_API dist_scene *dist_scene_create(dist_context *ctx, int count, const dist_
         placed->color_offset = scene->color_code_size;
         scene->color_code_size += (size_t)placed->field.color_code_size;
         if (scene->code_size + scene->color_code_size > 0x7fffffffu) {
-            disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: all codes together have more than 2^31 numbers", name, 0, 0);
+            disti_refuse(ctx, "%s: all codes together have more than 2^31 numbers", name);
             goto fail;
         }
     }
@@ -4292,9 +4284,7 @@ DIST_API dist_status dist_scene_find(dist_scene *scene, size_t n, const float *p
 {
     if (!scene) return DIST_BAD_ARGUMENT;
     if (n == 0) return DIST_OK;
-    if (!points || !index)
-        return disti_fail(scene->ctx, DIST_BAD_ARGUMENT, "dist_scene_find: %s is NULL", points ? "index" : "points", 0,
-                          0);
+    if (!points || !index) return disti_refuse(scene->ctx, "dist_scene_find: %s is NULL", points ? "index" : "points");
     disti_scene_job job = {scene, disti_cut(n, DISTI_SCENE_CHUNK, 1u << 20), points, index};
     disti_run(scene->ctx, job.pieces.count, disti_scene_find_task, &job);
     return DIST_OK;
@@ -6889,7 +6879,7 @@ DIST_API dist_status dist_shape_set_color_code(dist_shape *shape, const float *c
 {
     const char *name = "dist_shape_set_color_code";
     if (!shape) return DIST_BAD_ARGUMENT;
-    if (!shape->texture) return disti_fail(shape->ctx, DIST_BAD_ARGUMENT, "%s: the shape has no texture", name, 0, 0);
+    if (!shape->texture) return disti_refuse(shape->ctx, "%s: the shape has no texture", name);
     dist_shape *texture = shape->texture;
     size_t own = (size_t)shape->net->code_size, size = (size_t)texture->net->code_size;
     dist_status status = disti_code_copy(shape->ctx, name, size - own, color_code, texture->code + own);
@@ -6941,7 +6931,7 @@ DIST_API dist_shape *dist_shape_create(dist_context *ctx, const dist_net *net, c
 {
     if (disti_enter(ctx) != DIST_OK) return NULL;
     if (!net) {
-        disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_shape_create: net is NULL", NULL, 0, 0);
+        disti_refuse(ctx, "dist_shape_create: net is NULL", NULL);
         return NULL;
     }
     dist_shape *shape = (dist_shape *)disti_alloc(ctx, sizeof(dist_shape));
@@ -7023,9 +7013,8 @@ DIST_API dist_status dist_shape_eval(dist_context *ctx, dist_shape *shape, size_
     dist_status status = disti_enter(ctx);
     if (status != DIST_OK) return status;
     if (!shape || !points || !channels)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_shape_eval: shape, points or channels is NULL", NULL, 0, 0);
-    if (shape->ctx != ctx)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_shape_eval: shape belongs to another context", NULL, 0, 0);
+        return disti_refuse(ctx, "dist_shape_eval: shape, points or channels is NULL", NULL);
+    if (shape->ctx != ctx) return disti_refuse(ctx, "dist_shape_eval: shape belongs to another context", NULL);
     if (n == 0) return DIST_OK;
     disti_channels_job job = {shape, disti_cut(n, 8 * DISTI_BLOCK, 1u << 20), points, channels};
     disti_run(ctx, job.pieces.count, disti_channels_task, &job);
@@ -7123,8 +7112,7 @@ static dist_status disti_net_arrange(dist_context *ctx, dist_net *net, const cha
     net->panels = (float *)disti_alloc(ctx, net->panel_count * sizeof(float));
     if (net->code_count > 0) {
         size_t count;
-        if (!disti_size_mul((size_t)net->code_count, (size_t)net->code_size * sizeof(float), &count))
-            count = (size_t)-1;
+        disti_size_mul((size_t)net->code_count, (size_t)net->code_size * sizeof(float), &count);
         net->codes = (float *)disti_alloc(ctx, count);
     }
     return net->params && net->panels && (net->code_count == 0 || net->codes) ? DIST_OK : DIST_OUT_OF_MEMORY;
@@ -7211,7 +7199,7 @@ DIST_API dist_status dist_net_set_half(dist_context *ctx, dist_net *net, int kin
     const char *name = "dist_net_set_half";
     dist_status status = disti_enter(ctx);
     if (status != DIST_OK) return status;
-    if (!net) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: net is NULL", name, 0, 0);
+    if (!net) return disti_refuse(ctx, "%s: net is NULL", name);
     if (kind < DIST_HALF_OFF || kind > DIST_HALF_BF16)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: kind is %d, must be a DIST_HALF_ constant", name, kind, 0);
     float largest = disti_half_largest(net);
@@ -7544,7 +7532,7 @@ static dist_status disti_loader_open(disti_loader *loader, dist_context *ctx, co
     memset(loader, 0, sizeof *loader);
     loader->ctx = ctx;
     loader->function = "dist_net_load";
-    if (!bytes) return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_net_load: bytes is NULL", NULL, 0, 0);
+    if (!bytes) return disti_refuse(ctx, "dist_net_load: bytes is NULL", NULL);
     return disti_archive_open(ctx, loader->function, bytes, size, &loader->archive);
 }
 
@@ -7661,8 +7649,7 @@ DIST_API dist_status dist_net_save(dist_context *ctx, const dist_net *net, void 
     size_t count = 0;
     dist_status status = disti_enter(ctx);
     if (status != DIST_OK) return status;
-    if (!net || !size)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_net_save: %s is NULL", net ? "size" : "net", 0, 0);
+    if (!net || !size) return disti_refuse(ctx, "dist_net_save: %s is NULL", net ? "size" : "net");
     memset(tensors, 0, sizeof tensors);
     for (int l = 0; l < net->layers; l++) {
         const disti_linear *layer = &net->layer[l];
@@ -7699,7 +7686,7 @@ static unsigned char *disti_file_read(dist_context *ctx, const char *function, c
     int good = end >= 0 && end <= 0x7ffffff0L && fseek(file, 0, SEEK_SET) == 0;
     unsigned char *bytes = good ? (unsigned char *)disti_alloc(ctx, (size_t)end) : NULL;
     size_t got = bytes ? fread(bytes, 1, (size_t)end, file) : 0;
-    if (!path) disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: path is NULL", function, 0, 0);
+    if (!path) disti_refuse(ctx, "%s: path is NULL", function);
     else if (!file) disti_fail(ctx, DIST_IO, "%s: the file cannot be opened", function, 0, 0);
     else if (!good) disti_fail(ctx, DIST_IO, "%s: not a file that can be read whole", function, 0, 0);
     else if (bytes && got != (size_t)end)
@@ -7721,7 +7708,7 @@ static dist_status disti_file_write(dist_context *ctx, const char *function, con
         FILE *file = path ? fopen(path, "wb") : NULL;
         size_t put = file ? fwrite(bytes, 1, size, file) : 0;
         int closed = file ? fclose(file) : 0;
-        if (!path) status = disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: path is NULL", function, 0, 0);
+        if (!path) status = disti_refuse(ctx, "%s: path is NULL", function);
         else if (!file) status = disti_fail(ctx, DIST_IO, "%s: the file cannot be opened for writing", function, 0, 0);
         else if (put != size || closed != 0)
             status = disti_fail(ctx, DIST_IO, "%s: writing failed after %d of %d bytes", function, (double)put,
@@ -7871,8 +7858,7 @@ DIST_API dist_status dist_net_set_weights(dist_context *ctx, dist_net *net, cons
 {
     dist_status status = disti_enter(ctx);
     if (status != DIST_OK) return status;
-    if (!net || !weights)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_net_set_weights: %s is NULL", net ? "weights" : "net", 0, 0);
+    if (!net || !weights) return disti_refuse(ctx, "dist_net_set_weights: %s is NULL", net ? "weights" : "net");
     for (size_t i = 0; i < net->param_count; i++)
         if (!disti_finite(weights[i]))
             return disti_fail(ctx, DIST_NOT_FINITE, "dist_net_set_weights: weights[%d] is %d, must be finite", NULL,
@@ -7935,7 +7921,7 @@ static void disti_view_direction(const disti_view *view, double x, double y, dou
 
 static dist_status disti_camera_check(dist_context *ctx, const dist_camera *camera, const char *function)
 {
-    if (!camera) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: camera is NULL", function, 0, 0);
+    if (!camera) return disti_refuse(ctx, "%s: camera is NULL", function);
     if (camera->width < 1 || camera->width > 65536 || camera->height < 1 || camera->height > 65536)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: camera is %d x %d pixels, each side must be 1 to 65536",
                           function, camera->width, camera->height);
@@ -11733,22 +11719,20 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     if (status == DIST_OK) status = disti_camera_check(ctx, camera, name);
     if (status == DIST_OK) status = disti_tracer_init(&tracer, ctx, field, desc, name);
     if (status != DIST_OK) return status;
-    if (!out) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: out is NULL", name, 0, 0);
+    if (!out) return disti_refuse(ctx, "%s: out is NULL", name);
     if (tracer.how.any_hit || tracer.how.max_distance > 0.0f)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: how.any_hit and max_distance are for dist_trace", name, 0, 0);
+        return disti_refuse(ctx, "%s: how.any_hit and max_distance are for dist_trace", name);
     if (out->color && !field->color_fn)
         return disti_fail(ctx, DIST_UNSUPPORTED, "%s: out.color is wanted, but the field has no color", name, 0, 0);
-    if (tape && tape->ctx != ctx)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: tape belongs to another context", name, 0, 0);
+    if (tape && tape->ctx != ctx) return disti_refuse(ctx, "%s: tape belongs to another context", name);
     if (tape && (tape->width != camera->width || tape->height != camera->height))
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: tape is for another size than camera.width %d, height %d", name,
                           camera->width, camera->height);
     if (tracer.how.warm_start && (!tape || !tape->value))
-        return disti_fail(ctx, DIST_BAD_ARGUMENT,
-                          "dist_render: how.warm_start is 1, but tape is %s", tape ? "not made with it" : "NULL", 0, 0);
+        return disti_refuse(ctx, "dist_render: how.warm_start is 1, but tape is %s",
+                            tape ? "not made with it" : "NULL");
     if (tape && (tape->trace != tracer.how.trace || (tape->sample && tape->samples != tracer.how.samples)))
-        return disti_fail(ctx, DIST_BAD_ARGUMENT,
-                          "%s: tape was created with another trace or another number of samples", name, 0, 0);
+        return disti_refuse(ctx, "%s: tape was created with another trace or another number of samples", name);
     disti_view_of(camera, &view);
     disti_stats_begin(ctx);
     job.tracer = &tracer;
@@ -12236,16 +12220,14 @@ DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *ta
     dist_status status = disti_enter(ctx);
     if (status != DIST_OK) return status;
     if (!tape || !tape->rendered)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT,
-                          "dist_render_backward: tape is %s; it must have been filled by dist_render",
-                          tape ? "empty" : "NULL", 0, 0);
-    if (tape->ctx != ctx) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: tape belongs to another context", name, 0, 0);
-    if (!d_out) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: d_out is NULL", name, 0, 0);
+        return disti_refuse(ctx, "dist_render_backward: tape is %s; it must have been filled by dist_render",
+                            tape ? "empty" : "NULL");
+    if (tape->ctx != ctx) return disti_refuse(ctx, "%s: tape belongs to another context", name);
+    if (!d_out) return disti_refuse(ctx, "%s: d_out is NULL", name);
     status = disti_gradients_check(ctx, &tape->field, grads, name);
     if (status != DIST_OK) return status;
     if (d_out->silhouette && !tape->has_silhouette && tape->trace != DIST_TRACE_PAPER)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT,
-                          "%s: d_out.silhouette is given, but out.silhouette was NULL in dist_render", name, 0, 0);
+        return disti_refuse(ctx, "%s: d_out.silhouette is given, but out.silhouette was NULL in dist_render", name);
     if (d_out->color) status = disti_color_check(ctx, &tape->field, 1, name);
     if (status != DIST_OK) return status;
     memset(&job, 0, sizeof job);
@@ -12790,8 +12772,8 @@ DIST_API dist_mesh *dist_mesh_create(dist_context *ctx, size_t vertex_count, con
 {
     if (disti_enter(ctx) != DIST_OK) return NULL;
     if ((vertex_count && !vertices) || (triangle_count && !triangles)) {
-        disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_create: %s is NULL, but its count is not 0",
-                   vertex_count && !vertices ? "vertices" : "triangles", 0, 0);
+        disti_refuse(ctx, "dist_mesh_create: %s is NULL, but its count is not 0",
+                     vertex_count && !vertices ? "vertices" : "triangles");
         return NULL;
     }
     if (vertex_count > 0xfffffffeu || triangle_count > (size_t)-1 / (3 * sizeof(unsigned))) {
@@ -13233,7 +13215,7 @@ DIST_API dist_status dist_mesh_backward(dist_context *ctx, const dist_field *fie
     dist_status status = disti_enter(ctx);
     if (status != DIST_OK) return status;
     if (!mesh || (mesh->vertex_count && !d_vertices))
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_backward: %s is NULL", mesh ? "d_vertices" : "mesh", 0, 0);
+        return disti_refuse(ctx, "dist_mesh_backward: %s is NULL", mesh ? "d_vertices" : "mesh");
     for (size_t i = 0; i < mesh->vertex_count; i++)
         if (!disti_finite_all(3, d_vertices + 3 * i))
             return disti_fail(ctx, DIST_NOT_FINITE, "dist_mesh_backward: d_vertices of vertex %d is not finite", NULL,
@@ -13286,9 +13268,8 @@ DIST_API dist_status dist_mesh_sample(dist_context *ctx, const dist_mesh *mesh, 
     double sum = 0.0;
     dist_status status = disti_enter(ctx);
     if (status != DIST_OK) return status;
-    if (!mesh || (n && !points))
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_sample: %s is NULL", mesh ? "points" : "mesh", 0, 0);
-    if (count == 0) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: the mesh has no triangles", name, 0, 0);
+    if (!mesh || (n && !points)) return disti_refuse(ctx, "dist_mesh_sample: %s is NULL", mesh ? "points" : "mesh");
+    if (count == 0) return disti_refuse(ctx, "%s: the mesh has no triangles", name);
     if (!disti_mesh_check(mesh, DIST_BAD_ARGUMENT, "%s: a triangle has vertex %d, must be below %d", name))
         return DIST_BAD_ARGUMENT;
     disti_size_mul(count, sizeof(double), &bytes);
@@ -13481,8 +13462,8 @@ static dist_status disti_chamfer_one_way(dist_context *ctx, const disti_tree *fr
 
 static dist_status disti_chamfer_check(dist_context *ctx, size_t n, const float *points, const char *what)
 {
-    if (n == 0) return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_chamfer: %s has no points", what, 0, 0);
-    if (!points) return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_chamfer: %s is NULL", what, 0, 0);
+    if (n == 0) return disti_refuse(ctx, "dist_chamfer: %s has no points", what);
+    if (!points) return disti_refuse(ctx, "dist_chamfer: %s is NULL", what);
     for (size_t i = 0; i < n; i++)
         if (!disti_finite_all(3, points + 3 * i))
             return disti_fail(ctx, DIST_NOT_FINITE, "dist_chamfer: point %d of %s is not finite", what, (double)i, 0);
@@ -13498,7 +13479,7 @@ DIST_API dist_status dist_chamfer(dist_context *ctx, size_t n, const float *a, s
     if (status == DIST_OK) status = disti_chamfer_check(ctx, n, a, "a");
     if (status == DIST_OK) status = disti_chamfer_check(ctx, m, b, "b");
     if (status != DIST_OK) return status;
-    if (!chamfer && !one_way) return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_chamfer: chamfer is NULL", NULL, 0, 0);
+    if (!chamfer && !one_way) return disti_refuse(ctx, "dist_chamfer: chamfer is NULL", NULL);
     memset(trees, 0, sizeof trees);
     if (!disti_tree_begin(ctx, trees, n, a) || !disti_tree_begin(ctx, trees + 1, m, b)) status = DIST_OUT_OF_MEMORY;
     if (status == DIST_OK) status = disti_chamfer_one_way(ctx, trees, trees + 1, parts);
@@ -13590,7 +13571,7 @@ DIST_API dist_status dist_pfm_write(dist_context *ctx, int width, int height, in
     disti_writer sink = {header, 0};
     dist_status status = disti_pfm_check(ctx, name, width, height, channels, &floats);
     if (status != DIST_OK) return status;
-    if (!size) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: size is NULL", name, 0, 0);
+    if (!size) return disti_refuse(ctx, "%s: size is NULL", name);
     disti_put_text(&sink, channels == 3 ? "PF\n" : "Pf\n");
     disti_put_size(&sink, (size_t)width);
     disti_put_text(&sink, " ");
@@ -13598,7 +13579,7 @@ DIST_API dist_status dist_pfm_write(dist_context *ctx, int width, int height, in
     disti_put_text(&sink, "\n-1.0\n"); /* negative: little-endian */
     *size = sink.size + 4 * floats;
     if (!buffer) return DIST_OK;
-    if (!pixels) return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: pixels is NULL", name, 0, 0);
+    if (!pixels) return disti_refuse(ctx, "%s: pixels is NULL", name);
     if (capacity < *size) return disti_capacity(ctx, name, capacity, *size);
     memcpy(buffer, header, sink.size);
     sink.out = (unsigned char *)buffer;
@@ -13678,8 +13659,7 @@ DIST_API dist_status dist_pfm_read(dist_context *ctx, const void *bytes, size_t 
     dist_status status = disti_enter(ctx);
     if (status != DIST_OK) return status;
     if (!bytes || !width || !height || !channels)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_pfm_read: %s is NULL",
-                          bytes ? "width, height or channels" : "bytes", 0, 0);
+        return disti_refuse(ctx, "dist_pfm_read: %s is NULL", bytes ? "width, height or channels" : "bytes");
     status = disti_pfm_parse(ctx, "in memory", bytes, size, &pfm);
     if (status != DIST_OK) return status;
     if (pixels && capacity < pfm.floats) return disti_capacity(ctx, "dist_pfm_read", capacity, pfm.floats);
@@ -13699,8 +13679,7 @@ DIST_API dist_status dist_pfm_save(dist_context *ctx, const char *path, int widt
     size_t size = 0;
     dist_status status = dist_pfm_write(ctx, width, height, channels, pixels, NULL, 0, &size);
     if (status != DIST_OK) return status;
-    if (!path || !pixels)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_pfm_save: %s is NULL", path ? "pixels" : "path", 0, 0);
+    if (!path || !pixels) return disti_refuse(ctx, "dist_pfm_save: %s is NULL", path ? "pixels" : "path");
     void *bytes = disti_alloc(ctx, size);
     if (bytes) status = dist_pfm_write(ctx, width, height, channels, pixels, bytes, size, &size);
     return disti_file_write(ctx, "dist_pfm_save", path, bytes, size, status);
@@ -13714,7 +13693,7 @@ DIST_API float *dist_pfm_load(dist_context *ctx, const char *path, int *width, i
     size_t size = 0;
     if (disti_enter(ctx) != DIST_OK) return NULL;
     if (!path || !width || !height || !channels) {
-        disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: path, width, height or channels is NULL", name, 0, 0);
+        disti_refuse(ctx, "%s: path, width, height or channels is NULL", name);
         return NULL;
     }
     unsigned char *bytes = disti_file_read(ctx, name, path, &size);
@@ -14072,7 +14051,7 @@ DIST_API dist_mesh *dist_mesh_read(dist_context *ctx, const void *bytes, size_t 
 {
     if (disti_enter(ctx) != DIST_OK) return NULL;
     if (bytes) return disti_mesh_parse(ctx, "in memory", bytes, size);
-    disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_read: bytes is NULL", NULL, 0, 0);
+    disti_refuse(ctx, "dist_mesh_read: bytes is NULL", NULL);
     return NULL;
 }
 
@@ -14142,8 +14121,7 @@ DIST_API dist_status dist_mesh_write(dist_context *ctx, const dist_mesh *mesh, i
     disti_writer sink = {NULL, 0};
     dist_status status = disti_enter(ctx);
     if (status != DIST_OK) return status;
-    if (!mesh || !size)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_write: %s is NULL", mesh ? "size" : "mesh", 0, 0);
+    if (!mesh || !size) return disti_refuse(ctx, "dist_mesh_write: %s is NULL", mesh ? "size" : "mesh");
     if (format != DIST_MESH_PLY && format != DIST_MESH_OBJ)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: format is %d, must be DIST_MESH_PLY or DIST_MESH_OBJ", name,
                           format, 0);
@@ -14179,12 +14157,10 @@ DIST_API dist_status dist_mesh_save(dist_context *ctx, const dist_mesh *mesh, co
     size_t size = 0, n = path ? strlen(path) : 0;
     dist_status status = disti_enter(ctx);
     if (status != DIST_OK) return status;
-    if (!mesh || !path)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_save: %s is NULL", mesh ? "path" : "mesh", 0, 0);
+    if (!mesh || !path) return disti_refuse(ctx, "dist_mesh_save: %s is NULL", mesh ? "path" : "mesh");
     int ply = n >= 4 && (memcmp(path + n - 4, ".ply", 4) == 0 || memcmp(path + n - 4, ".PLY", 4) == 0);
     int obj = n >= 4 && (memcmp(path + n - 4, ".obj", 4) == 0 || memcmp(path + n - 4, ".OBJ", 4) == 0);
-    if (!ply && !obj)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_save: %s: must end in .ply or .obj", path, 0, 0);
+    if (!ply && !obj) return disti_refuse(ctx, "dist_mesh_save: %s: must end in .ply or .obj", path);
     int format = ply ? DIST_MESH_PLY : DIST_MESH_OBJ;
     status = dist_mesh_write(ctx, mesh, format, NULL, 0, &size);
     if (status != DIST_OK) return status;
@@ -14267,8 +14243,7 @@ static dist_status disti_measure_shapes(dist_context *ctx, const dist_net *net, 
     if (status != DIST_OK) return status;
     dist_field field = dist_shape_field(&shape);
     size_t codes;
-    if (!disti_size_mul((size_t)instances, disti_field_code(&field) + 7 + (size_t)field.color_code_size, &codes))
-        codes = (size_t)-1;
+    disti_size_mul((size_t)instances, disti_field_code(&field) + 7 + (size_t)field.color_code_size, &codes);
     return disti_partial_for(ctx, codes);
 }
 

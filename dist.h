@@ -1137,6 +1137,14 @@ static void *disti_alloc(dist_context *ctx, size_t bytes)
     return p;
 }
 
+/* Room for count things of `each` bytes. */
+static void *disti_alloc_array(dist_context *ctx, size_t count, size_t each)
+{
+    size_t bytes;
+    disti_size_mul(count, each, &bytes);
+    return disti_alloc(ctx, bytes);
+}
+
 /* bytes as given to disti_alloc; p may be NULL. */
 static void disti_free(dist_context *ctx, void *p, size_t bytes)
 {
@@ -1330,15 +1338,18 @@ static dist_status disti_enter(const dist_context *ctx)
     return ctx->workers > 0 ? DIST_OK : ctx->status;
 }
 
+/* n to the next multiple of `to`, a power of two; small sizes: cannot overflow. */
+static size_t disti_round_up(size_t n, size_t to)
+{
+    return (n + to - 1) & ~(to - 1);
+}
+
 /* Makes each worker's lane at least `bytes`. The contents do not survive: create functions only. */
 static dist_status disti_lanes_reserve(dist_context *ctx, size_t bytes)
 {
-    size_t each, total;
     if (bytes <= ctx->lane_bytes) return DIST_OK;
-    disti_size_add(bytes, DISTI_ALIGNMENT - 1, &each);
-    each &= ~(size_t)(DISTI_ALIGNMENT - 1);
-    disti_size_mul(each, (size_t)ctx->workers, &total);
-    unsigned char *lanes = (unsigned char *)disti_alloc(ctx, total);
+    size_t each = disti_round_up(bytes, DISTI_ALIGNMENT);
+    unsigned char *lanes = (unsigned char *)disti_alloc_array(ctx, (size_t)ctx->workers, each);
     if (!lanes) return DIST_OUT_OF_MEMORY;
     disti_free(ctx, ctx->lanes, ctx->lane_bytes * (size_t)ctx->workers);
     ctx->lanes = lanes;
@@ -1359,10 +1370,8 @@ static unsigned char *disti_lane(const dist_context *ctx, int worker)
 /* The next `count` things of `size` bytes in a block of memory; base NULL: only *at moves on. */
 static void *disti_take(unsigned char *base, size_t *at, size_t count, size_t size)
 {
-    size_t bytes = (count * size + DISTI_ALIGNMENT - 1) &
-                   ~(size_t)(DISTI_ALIGNMENT - 1); /* small factors: cannot overflow */
     unsigned char *p = base ? base + *at : NULL;
-    *at += bytes;
+    *at += disti_round_up(count * size, DISTI_ALIGNMENT);
     return p;
 }
 
@@ -1388,10 +1397,8 @@ static disti_counter *disti_counter_of(const dist_context *ctx, int worker)
 
 static dist_status disti_partial_reserve(dist_context *ctx, size_t size)
 {
-    size_t bytes;
     if (size <= ctx->partial_size) return DIST_OK;
-    disti_size_mul(size, DISTI_SLOTS * sizeof(double), &bytes);
-    double *partial = (double *)disti_alloc(ctx, bytes);
+    double *partial = (double *)disti_alloc_array(ctx, size, DISTI_SLOTS * sizeof(double));
     if (!partial) return DIST_OUT_OF_MEMORY;
     disti_free(ctx, ctx->partial, ctx->partial_size * DISTI_SLOTS * sizeof(double));
     ctx->partial = partial;
@@ -1410,10 +1417,8 @@ static dist_status disti_partial_for(dist_context *ctx, size_t codes)
 #ifndef DIST_NO_TRAIN
 static dist_status disti_store_reserve(dist_context *ctx, size_t size)
 {
-    size_t bytes;
     if (size <= ctx->store_size) return DIST_OK;
-    disti_size_mul(size, sizeof(float), &bytes);
-    float *store = (float *)disti_alloc(ctx, bytes);
+    float *store = (float *)disti_alloc_array(ctx, size, sizeof(float));
     if (!store) return DIST_OUT_OF_MEMORY;
     disti_free(ctx, ctx->store, ctx->store_size * sizeof(float));
     ctx->store = store;
@@ -1491,9 +1496,7 @@ static dist_status disti_context_begin(dist_context *ctx, const dist_context_des
 #ifndef DISTI_OPENMP
     if (!ctx->scheduler.run_fn) ctx->workers = 1;
 #endif
-    size_t total;
-    disti_size_mul(DISTI_SCRATCH_BYTES, (size_t)ctx->workers, &total);
-    ctx->scratch = (unsigned char *)disti_alloc(ctx, total);
+    ctx->scratch = (unsigned char *)disti_alloc_array(ctx, (size_t)ctx->workers, DISTI_SCRATCH_BYTES);
     return ctx->scratch ? DIST_OK : DIST_OUT_OF_MEMORY;
 }
 
@@ -4140,12 +4143,13 @@ static dist_status disti_scene_take(dist_scene *scene)
 {
     dist_context *ctx = scene->ctx;
     disti_scene_work w;
-    size_t lanes, count = (size_t)scene->count;
+    size_t count = (size_t)scene->count;
     scene->scratch_bytes = disti_scene_layout(scene, NULL, &w);
-    disti_size_mul(scene->scratch_bytes, (size_t)ctx->workers, &lanes);
-    scene->placed = (disti_placed *)disti_alloc(ctx, count * sizeof(disti_placed));
-    scene->ball = scene->placed ? (disti_ball *)disti_alloc(ctx, count * sizeof(disti_ball)) : NULL;
-    scene->scratch = scene->ball ? (unsigned char *)disti_alloc(ctx, lanes) : NULL;
+    scene->placed = (disti_placed *)disti_alloc_array(ctx, count, sizeof(disti_placed));
+    if (!scene->placed) return DIST_OUT_OF_MEMORY;
+    scene->ball = (disti_ball *)disti_alloc_array(ctx, count, sizeof(disti_ball));
+    if (!scene->ball) return DIST_OUT_OF_MEMORY;
+    scene->scratch = (unsigned char *)disti_alloc_array(ctx, (size_t)ctx->workers, scene->scratch_bytes);
     return scene->scratch ? DIST_OK : DIST_OUT_OF_MEMORY;
 }
 
@@ -5189,7 +5193,7 @@ typedef struct disti_block {
 static size_t disti_block_layout(const dist_net *net, unsigned char *base, disti_block *b)
 {
     size_t at = 0, rows = (size_t)net->max_rows, layers = (size_t)net->layers, row = DISTI_BLOCK * sizeof(float);
-    size_t point = ((size_t)net->point_size + 7) & ~(size_t)7;
+    size_t point = disti_round_up((size_t)net->point_size, 8);
     memset(b, 0, sizeof *b);
     b->point = (float *)disti_take(base, &at, point, row);
     b->d_point = (float *)disti_take(base, &at, point, row);
@@ -5215,12 +5219,12 @@ static size_t disti_block_layout(const dist_net *net, unsigned char *base, disti
    scaled, the pre-activation's delta (out8, B), and the sums for LayerNorm's gamma and beta (out8 each). */
 static size_t disti_store_stride(const disti_linear *layer)
 {
-    return ((size_t)(layer->prev + layer->point) + 15) & ~(size_t)15;
+    return disti_round_up((size_t)(layer->prev + layer->point), 16);
 }
 
 static size_t disti_store_out(const disti_linear *layer)
 {
-    return ((size_t)layer->out + 15) & ~(size_t)15;
+    return disti_round_up((size_t)layer->out, 16);
 }
 
 enum { DISTI_STORE_INPUT, DISTI_STORE_DELTA, DISTI_STORE_NORM };
@@ -5344,21 +5348,21 @@ static void disti_list_alive(const dist_shape *shape, disti_block *b, int l)
     b->alive_count[l] = count;
 }
 
-/* A linear layer by the user's BLAS: the previous units' columns, then the point's. */
-static void disti_linear_blas(const dist_shape *shape, int l, const float *bias, const float *x, float *y)
+/* A linear layer by the user's BLAS, rows of `stride`: the previous units' columns, then the point's. The product is
+   added to the bias, since a BLAS clears y in a pass of its own where it is not to add. */
+static void disti_linear_blas(const dist_shape *shape, int l, const float *bias, int columns, int stride,
+                              const float *x, const float *point, float *y)
 {
-    const dist_net *net = shape->net;
-    const disti_linear *layer = &net->layer[l];
+    const disti_linear *layer = &shape->net->layer[l];
     const dist_blas *blas = &shape->ctx->blas;
-    const float *w = net->params + layer->weight;
+    const float *w = shape->net->params + layer->weight;
     for (size_t o = 0; o < (size_t)layer->out; o++)
-        for (size_t c = 0; c < DISTI_BLOCK; c++) y[o * DISTI_BLOCK + c] = bias[o];
-    if (layer->prev > 0)
-        blas->sgemm_fn(blas->user, 0, 0, layer->out, DISTI_BLOCK, layer->prev, layer->scale, w + layer->x_column,
-                       layer->in, x, DISTI_BLOCK, 1.0f, y, DISTI_BLOCK);
+        for (size_t c = 0; c < (size_t)columns; c++) y[o * (size_t)stride + c] = bias[o];
+    blas->sgemm_fn(blas->user, 0, 0, layer->out, columns, layer->prev, layer->scale, w + layer->x_column, layer->in, x,
+                   stride, 1.0f, y, stride);
     if (layer->point > 0)
-        blas->sgemm_fn(blas->user, 0, 0, layer->out, DISTI_BLOCK, layer->point, layer->scale, w + layer->point_column,
-                       layer->in, x + (size_t)layer->prev * DISTI_BLOCK, DISTI_BLOCK, 1.0f, y, DISTI_BLOCK);
+        blas->sgemm_fn(blas->user, 0, 0, layer->out, columns, layer->point, layer->scale, w + layer->point_column,
+                       layer->in, point, stride, 1.0f, y, stride);
 }
 
 static int disti_use_blas(const dist_shape *shape, int l)
@@ -5426,7 +5430,7 @@ static void disti_hidden(const dist_shape *shape, const disti_kernels *kernels, 
     const float *bias = shape->bias + (size_t)(b->half ? net->layers : l) * width;
     int plain = net->activation == DIST_ACTIVATION_RELU && !net->normed && !b->half;
     if (disti_use_blas(shape, l)) {
-        disti_linear_blas(shape, l, bias, x, y);
+        disti_linear_blas(shape, l, bias, DISTI_BLOCK, DISTI_BLOCK, x, x + (size_t)layer->prev * DISTI_BLOCK, y);
         if (plain) kernels->relu(out, y, mask);
     } else {
         disti_gemm g;
@@ -5565,7 +5569,7 @@ static void disti_hidden_delta(const dist_net *net, const disti_kernels *kernels
 
 /* delta of layer l's pre-activation to its input rows d_x: W^T delta, masked. */
 static void disti_linear_backward(const dist_shape *shape, const disti_kernels *kernels, const disti_block *b, int l,
-                                  const float *delta, float *d_x)
+                                  float *delta, float *d_x)
 {
     const dist_net *net = shape->net;
     const disti_linear *layer = &net->layer[l];
@@ -5581,13 +5585,8 @@ static void disti_linear_backward(const dist_shape *shape, const disti_kernels *
         const float *w = net->params + layer->weight;
         if (relu && !net->normed) { /* rows that no kernel wrote are zero for a BLAS */
             const uint64_t *mine = b->mask + (size_t)(l + 1) * width;
-            union {
-                const float *in;
-                float *out; /* the worker's own scratch */
-            } rows;
-            rows.in = delta;
             for (size_t u = 0; u < (size_t)layer->out; u++)
-                if (!mine[u]) memset(rows.out + u * DISTI_BLOCK, 0, DISTI_BLOCK * sizeof(float));
+                if (!mine[u]) memset(delta + u * DISTI_BLOCK, 0, DISTI_BLOCK * sizeof(float));
         }
         blas->sgemm_fn(blas->user, 1, 0, layer->prev, DISTI_BLOCK, layer->out, layer->scale, w + layer->x_column,
                        layer->in, delta, DISTI_BLOCK, 0.0f, d_x, DISTI_BLOCK);
@@ -5881,25 +5880,15 @@ static size_t disti_wide_floats(const dist_context *ctx, const dist_net *net)
     return (size_t)(2 * net->max_rows + net->point_size) * DISTI_WIDE_COLUMNS;
 }
 
-/* Hidden layer l by the BLAS: y = activation(W x + W_point point + bias), rows of DISTI_WIDE_COLUMNS. The product is
-   added to the bias, since a BLAS clears y in a pass of its own where it is not to add. */
+/* Hidden layer l by the BLAS: y = activation(W x + W_point point + bias), rows of DISTI_WIDE_COLUMNS. */
 static void disti_wide_hidden(const dist_shape *shape, const disti_kernels *kernels, int l, int columns, const float *x,
                               const float *point, float *y)
 {
     const dist_net *net = shape->net;
-    const disti_linear *layer = &net->layer[l];
-    const dist_blas *blas = &shape->ctx->blas;
-    const float *w = net->params + layer->weight, *bias = shape->bias + (size_t)l * (size_t)net->max_rows;
-    const int ld = DISTI_WIDE_COLUMNS;
     uint64_t mask[DISTI_WIDE];
-    for (size_t o = 0; o < (size_t)layer->out; o++)
-        for (size_t c = 0; c < (size_t)columns; c++) y[o * DISTI_WIDE_COLUMNS + c] = bias[o];
-    blas->sgemm_fn(blas->user, 0, 0, layer->out, columns, layer->prev, layer->scale, w + layer->x_column, layer->in, x,
-                   ld, 1.0f, y, ld);
-    if (layer->point > 0)
-        blas->sgemm_fn(blas->user, 0, 0, layer->out, columns, layer->point, layer->scale, w + layer->point_column,
-                       layer->in, point, ld, 1.0f, y, ld);
-    for (size_t o = 0; o < (size_t)layer->out; o++) {
+    disti_linear_blas(shape, l, shape->bias + (size_t)l * (size_t)net->max_rows, columns, DISTI_WIDE_COLUMNS, x, point,
+                      y);
+    for (size_t o = 0; o < (size_t)net->layer[l].out; o++) {
         float *row = y + o * DISTI_WIDE_COLUMNS;
         if (net->activation == DIST_ACTIVATION_RELU) kernels->relu((size_t)(columns / DISTI_BLOCK), row, mask);
         else kernels->activate(net->activation, net->scale, (size_t)columns, row, NULL);
@@ -5993,7 +5982,7 @@ static size_t disti_group_layout(const dist_net *net, unsigned char *base, const
 {
     size_t at = 0, rows = (size_t)net->max_rows, row = DISTI_BLOCK * sizeof(float);
     memset(g, 0, sizeof *g);
-    g->width = (rows * 3 / 4 + 7) & ~(size_t)7;
+    g->width = disti_round_up(rows * 3 / 4, 8);
     g->panel_size = rows * rows / 3;
     g->x[0] = b->act[0]; /* and the three after it: they are not used at the same time */
     g->x[1] = (float *)disti_take(base, &at, DISTI_GROUP * g->width, row);
@@ -6249,7 +6238,7 @@ static int disti_group_eval(const dist_shape *shape, int worker, disti_group *g,
         const disti_linear *layer = &net->layer[l];
         int *unit = g->unit[(l + 1) & 1];
         units = disti_group_units(shape, &kernels, g, l, slack, unit);
-        size_t most = ((size_t)units + 7) & ~(size_t)7;
+        size_t most = disti_round_up((size_t)units, 8);
         if (most + (size_t)net->layer[l + 1].point > g->width || most * (size_t)g->count > g->panel_size) return 0;
         disti_group_pack(shape, g, l, units, unit);
         disti_group_layer(shape, &kernels, g, l, units);
@@ -7043,8 +7032,9 @@ DIST_API size_t dist_net_operations(const dist_net *net, int folded)
     return sum;
 }
 
-static void disti_net_free(dist_net *net)
+DIST_API void dist_net_destroy(dist_net *net)
 {
+    if (!net) return;
     dist_allocator allocator = net->allocator;
     if (net->params) allocator.free_fn(allocator.user, net->params, net->param_count * sizeof(float));
     if (net->panels) allocator.free_fn(allocator.user, net->panels, net->panel_count * sizeof(float));
@@ -7052,11 +7042,6 @@ static void disti_net_free(dist_net *net)
     if (net->codes)
         allocator.free_fn(allocator.user, net->codes, (size_t)net->code_count * (size_t)net->code_size * sizeof(float));
     allocator.free_fn(allocator.user, net, sizeof *net);
-}
-
-DIST_API void dist_net_destroy(dist_net *net)
-{
-    if (net) disti_net_free(net);
 }
 
 static void disti_net_begin(dist_context *ctx, dist_net *net)
@@ -7101,20 +7086,16 @@ static dist_status disti_net_arrange(dist_context *ctx, dist_net *net, const cha
         layer->norm_bias = layer->norm_weight + (size_t)layer->out;
         int normed = net->normed && l + 1 < net->layers;
         net->param_count = normed ? layer->norm_bias + (size_t)layer->out : layer->norm_weight;
-        size_t rows = (size_t)(layer->prev + layer->point), out8 = ((size_t)layer->out + 7) & ~(size_t)7;
+        size_t rows = (size_t)(layer->prev + layer->point), out = (size_t)layer->out;
         layer->panel = net->panel_count;
-        net->panel_count += (l + 1 < net->layers ? out8 * rows : (size_t)layer->out * rows) + 15;
-        net->panel_count &= ~(size_t)15;
-        net->max_rows = DISTI_MAX(net->max_rows, (int)((DISTI_MAX(rows, (size_t)layer->out) + 7) & ~(size_t)7));
+        net->panel_count += disti_round_up((l + 1 < net->layers ? disti_round_up(out, 8) : out) * rows, 16);
+        net->max_rows = DISTI_MAX(net->max_rows, (int)disti_round_up(DISTI_MAX(rows, out), 8));
         net->fold_count += layer->code > 0;
     }
-    net->params = (float *)disti_alloc(ctx, net->param_count * sizeof(float));
-    net->panels = (float *)disti_alloc(ctx, net->panel_count * sizeof(float));
-    if (net->code_count > 0) {
-        size_t count;
-        disti_size_mul((size_t)net->code_count, (size_t)net->code_size * sizeof(float), &count);
-        net->codes = (float *)disti_alloc(ctx, count);
-    }
+    net->params = (float *)disti_alloc_array(ctx, net->param_count, sizeof(float));
+    net->panels = (float *)disti_alloc_array(ctx, net->panel_count, sizeof(float));
+    if (net->code_count > 0)
+        net->codes = (float *)disti_alloc_array(ctx, (size_t)net->code_count, (size_t)net->code_size * sizeof(float));
     return net->params && net->panels && (net->code_count == 0 || net->codes) ? DIST_OK : DIST_OUT_OF_MEMORY;
 }
 
@@ -7126,7 +7107,7 @@ static size_t disti_half_steps(const disti_linear *layer, int kind)
 /* Numbers of 32 bits in half_panels. */
 static size_t disti_half_size(const disti_linear *layer, int kind)
 {
-    return disti_half_steps(layer, kind) * (((size_t)layer->out + 7) & ~(size_t)7);
+    return disti_half_steps(layer, kind) * disti_round_up((size_t)layer->out, 8);
 }
 
 /* The largest weight that is packed. */
@@ -7135,7 +7116,7 @@ static float disti_half_largest(const dist_net *net)
     float largest = 0.0f;
     for (int l = 1; l + 1 < net->layers; l++) {
         const disti_linear *layer = &net->layer[l];
-        size_t rows = (size_t)(layer->prev + layer->point), count = ((size_t)layer->out + 7) / 8 * 8 * rows;
+        size_t rows = (size_t)(layer->prev + layer->point), count = disti_round_up((size_t)layer->out, 8) * rows;
         for (size_t i = 0; i < count; i++) {
             float w = net->panels[layer->panel + i];
             if (i / 8 % rows < (size_t)layer->prev) largest = DISTI_MAX(largest, w < 0.0f ? -w : w);
@@ -11818,7 +11799,7 @@ typedef struct disti_render_backward_job {
 static void disti_render_seed(void *user, size_t first, size_t count, const float *sdf, const float *gradient,
                               float *d_sdf)
 {
-    const dist_tape *tape = (const dist_tape *)user;
+    const dist_tape *tape = ((const disti_render_backward_job *)user)->tape;
     int mode = tape->tracer.how.gradient;
     (void)sdf;
     for (size_t i = 0; i < count; i++) {
@@ -11901,15 +11882,10 @@ static void disti_backward_flush(disti_render_backward_job *job)
 {
     const dist_tape *tape = job->tape;
     const dist_field *field = &tape->field;
-    union {
-        const dist_tape *in;
-        void *out; /* the tape's work space is written through it */
-    } user;
     if (job->count == 0) return;
     if (field->many) disti_backward_sort(job);
-    user.in = tape;
     memset(tape->d_points, 0, 3 * job->count * sizeof(float));
-    disti_field_backward_all(job->ctx, field, job->count, tape->points, tape->d_sdf, disti_render_seed, user.out,
+    disti_field_backward_all(job->ctx, field, job->count, tape->points, tape->d_sdf, disti_render_seed, job,
                              tape->d_points, job->d_code);
     if (job->grads->weights)
         field->weights_fn(field->user, job->ctx, job->count, tape->points, tape->d_sdf, NULL, NULL, NULL, NULL,

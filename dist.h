@@ -3008,6 +3008,14 @@ static double disti_rotation_off(const double m[9], double *determinant)
     return worst;
 }
 
+/* Refuses what is not a rotation, by a sentence that takes how far it is off and the determinant. */
+static dist_status disti_rotation_check(dist_context *ctx, const double m[9], const char *format, const char *function)
+{
+    double determinant, off = disti_rotation_off(m, &determinant);
+    return off > 1e-3 || determinant < 0.0 ? disti_fail(ctx, DIST_BAD_ARGUMENT, format, function, off, determinant)
+                                           : DIST_OK;
+}
+
 /* m <- exp([w]x) m by Rodrigues: exp([w]x) = I + a [w]x + b [w]x^2, a = sin|w| / |w|, b = (1 - cos|w|) / |w|^2;
    kept orthonormal. */
 static void disti_turn(const float w[3], float m[9])
@@ -3199,6 +3207,13 @@ static disti_pieces disti_cut(size_t n, size_t size, size_t most)
     return p;
 }
 
+/* How many points the piece has; *first: which is its first. */
+static size_t disti_piece(const disti_pieces *p, int index, size_t *first)
+{
+    *first = (size_t)index * p->size;
+    return DISTI_MIN(p->size, p->n - *first);
+}
+
 typedef struct disti_eval_job {
     const dist_field *field;
     disti_pieces pieces;
@@ -3209,8 +3224,7 @@ typedef struct disti_eval_job {
 static void disti_eval_task(void *arg, int index, int worker)
 {
     const disti_eval_job *job = (const disti_eval_job *)arg;
-    size_t first = (size_t)index * job->pieces.size;
-    size_t n = DISTI_MIN(job->pieces.size, job->pieces.n - first);
+    size_t first, n = disti_piece(&job->pieces, index, &first);
     job->field->eval_fn(job->field->user, worker, n, job->points + 3 * first, job->sdf + first,
                         job->gradient ? job->gradient + 3 * first : NULL);
 }
@@ -3249,14 +3263,13 @@ static void disti_color_task(void *arg, int index, int worker)
 {
     const disti_color_job *job = (const disti_color_job *)arg;
     const dist_field *field = job->field;
-    size_t first = (size_t)index * job->pieces.size, size = (size_t)field->code_size + (size_t)field->color_code_size;
-    size_t n = DISTI_MIN(job->pieces.size, job->pieces.n - first);
+    size_t first, n = disti_piece(&job->pieces, index, &first);
     const float *points = job->points + 3 * first;
     if (job->color) {
         field->color_fn(field->user, worker, n, points, job->color + 3 * first);
         return;
     }
-    double *d_code = job->slots + (size_t)index * size;
+    double *d_code = job->slots + (size_t)index * ((size_t)field->code_size + (size_t)field->color_code_size);
     field->color_adjoint_fn(field->user, worker, n, points, job->d_color + 3 * first,
                             job->d_points ? job->d_points + 3 * first : NULL, job->code ? d_code : NULL,
                             job->color_code ? d_code + field->code_size : NULL);
@@ -3370,10 +3383,8 @@ static void disti_backward_task(void *arg, int index, int worker)
 {
     const disti_backward_job *job = (const disti_backward_job *)arg;
     const dist_field *field = job->field;
-    disti_backward_piece piece;
-    piece.job = job;
-    piece.first = (size_t)index * job->pieces.size;
-    size_t n = DISTI_MIN(job->pieces.size, job->pieces.n - piece.first);
+    disti_backward_piece piece = {job, 0};
+    size_t n = disti_piece(&job->pieces, index, &piece.first);
     double *d_code = job->d_code ? job->d_code + (size_t)index * (size_t)field->code_size : NULL;
     const float *points = job->points + 3 * piece.first;
     if (job->directions) {
@@ -3472,6 +3483,24 @@ static int disti_gradients_camera(const dist_gradients *grads)
     return grads->rotation || grads->translation || grads->focal || grads->principal;
 }
 
+/* disti_gradients_check where there is neither camera nor color. */
+static dist_status disti_gradients_plain(dist_context *ctx, const dist_field *field, const dist_gradients *grads,
+                                         const char *function)
+{
+    dist_status status = disti_gradients_check(ctx, field, grads, function);
+    if (status != DIST_OK || (!disti_gradients_camera(grads) && !grads->color_code && !grads->color_weights))
+        return status;
+    return disti_refuse(ctx, "%s: what grads holds of camera and color must be NULL: there is none here", function);
+}
+
+/* total: of the code, then of the color's code. */
+static void disti_codes_add(const dist_field *field, const dist_gradients *grads, const double *total)
+{
+    for (int j = 0; grads->code && j < field->code_size; j++) disti_add_gradient(&grads->code[j], total[j]);
+    for (int j = 0; grads->color_code && j < field->color_code_size; j++)
+        disti_add_gradient(&grads->color_code[j], total[field->code_size + j]);
+}
+
 DIST_API dist_status dist_color_backward(dist_context *ctx, const dist_field *field, size_t n, const float *points,
                                          const float *d_color, float *d_points, const dist_gradients *grads)
 {
@@ -3493,15 +3522,13 @@ DIST_API dist_status dist_color_backward(dist_context *ctx, const dist_field *fi
     status = disti_gradients_check(ctx, field, &mine, name);
     if (status != DIST_OK || n == 0) return status;
     if (!points || !d_color) return disti_refuse(ctx, "dist_color_backward: %s is NULL", points ? "d_color" : "points");
-    size_t code = (size_t)field->code_size, size = code + (size_t)field->color_code_size;
+    size_t size = (size_t)field->code_size + (size_t)field->color_code_size;
     status = disti_partial_for(ctx, size);
     if (status != DIST_OK) return status;
     double *total = ctx->partial + (size_t)DISTI_SLOTS * size;
     memset(total, 0, size * sizeof(double));
     disti_color_backward_all(ctx, field, n, points, d_color, d_points, grads, total);
-    for (size_t j = 0; grads->code && j < code; j++) disti_add_gradient(&grads->code[j], total[j]);
-    for (size_t j = code; grads->color_code && j < size; j++)
-        disti_add_gradient(&grads->color_code[j - code], total[j]);
+    disti_codes_add(field, grads, total);
     return DIST_OK;
 }
 
@@ -3528,13 +3555,11 @@ DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *fi
     const char *name = "dist_field_backward";
     dist_status status = disti_enter(ctx);
     if (status == DIST_OK) status = disti_field_check(ctx, field, name);
-    if (status == DIST_OK) status = disti_gradients_check(ctx, field, grads, name);
+    if (status == DIST_OK) status = disti_gradients_plain(ctx, field, grads, name);
     if (status != DIST_OK || n == 0) return status;
     if (!points) return disti_refuse(ctx, "%s: points is NULL", name);
     if (!d_sdf && (!seed_fn || grads->weights))
         return disti_refuse(ctx, "%s: d_sdf is NULL, needed without seed_fn and for weights", name);
-    if (disti_gradients_camera(grads) || grads->color_code || grads->color_weights)
-        return disti_refuse(ctx, "%s: what grads holds of camera and color must be NULL: there is none here", name);
     double *d_code;
     status = disti_code_begin(ctx, field, grads, &d_code);
     if (status != DIST_OK) return status;
@@ -3557,13 +3582,11 @@ DIST_API dist_status dist_field_eikonal(dist_context *ctx, const dist_field *fie
     dist_status status = disti_enter(ctx);
     if (loss) *loss = 0.0f;
     if (status == DIST_OK) status = disti_field_check(ctx, field, name);
-    if (status == DIST_OK && grads) status = disti_gradients_check(ctx, field, grads, name);
+    if (status == DIST_OK && grads) status = disti_gradients_plain(ctx, field, grads, name);
     if (status != DIST_OK || n == 0) return status;
     if (!points) return disti_refuse(ctx, "%s: points is NULL", name);
     if (!disti_finite(weight))
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: weight is %d, must be finite", name, (double)weight, 0);
-    if (grads && (disti_gradients_camera(grads) || grads->color_code || grads->color_weights))
-        return disti_refuse(ctx, "%s: what grads holds of camera and color must be NULL: there is none here", name);
     if (grads && !grads->code && !grads->weights) grads = NULL;
     if (grads) status = disti_code_begin(ctx, field, grads, &d_code);
     int exact = field->second_fn && (!grads || !grads->weights || field->second_weights_fn);
@@ -3674,6 +3697,11 @@ static size_t disti_scene_layout(const dist_scene *scene, unsigned char *base, d
     w->kept = (int *)disti_take(base, &at, n, sizeof(int));
     w->nearest = (float *)disti_take(base, &at, n, sizeof(float));
     return at;
+}
+
+static unsigned char *disti_scene_scratch(const dist_scene *scene, int worker)
+{
+    return scene->scratch + scene->scratch_bytes * (size_t)worker;
 }
 
 static float disti_ball_distance(const disti_ball *ball, const float *p)
@@ -3927,7 +3955,7 @@ static void disti_scene_fused(void *user, int worker, size_t n, const float *poi
 {
     const dist_scene *scene = (const dist_scene *)user;
     disti_scene_work w;
-    disti_scene_layout(scene, scene->scratch + scene->scratch_bytes * (size_t)worker, &w);
+    disti_scene_layout(scene, disti_scene_scratch(scene, worker), &w);
     disti_scene_link link = {scene, &w, NULL, 0, 0, NULL, NULL, seed_fn, seed_user, d_code};
     for (size_t at = 0; at < n; at += DISTI_SCENE_CHUNK) {
         size_t count = DISTI_MIN(n - at, (size_t)DISTI_SCENE_CHUNK);
@@ -3999,7 +4027,7 @@ static void disti_scene_paint(const dist_scene *scene, int worker, size_t n, con
                               const disti_scene_pull *back)
 {
     disti_scene_work w;
-    disti_scene_layout(scene, scene->scratch + scene->scratch_bytes * (size_t)worker, &w);
+    disti_scene_layout(scene, disti_scene_scratch(scene, worker), &w);
     for (size_t at = 0; at < n; at += DISTI_SCENE_CHUNK) {
         size_t count = DISTI_MIN(n - at, (size_t)DISTI_SCENE_CHUNK);
         disti_scene_pull pull = {NULL, NULL, NULL, NULL};
@@ -4064,12 +4092,10 @@ static dist_status disti_scene_place(dist_scene *scene, int k, const dist_instan
     dist_context *ctx = scene->ctx;
     disti_placed *placed = &scene->placed[k], next = *placed;
     const dist_similarity *s = &instance->placement;
-    double m[9], determinant, square = 0.0;
-    if (create || instance->field) {
-        dist_status status = disti_field_check(ctx, instance->field, function);
-        if (status != DIST_OK) return status;
-        next.field = *instance->field;
-    }
+    double m[9], square = 0.0;
+    dist_status status = create || instance->field ? disti_field_check(ctx, instance->field, function) : DIST_OK;
+    if (status != DIST_OK) return status;
+    if (instance->field) next.field = *instance->field;
     if (!create && disti_field_code(&next.field) != placed->code)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.code_size is %d, must stay what it was: %d", function,
                           (double)disti_field_code(&next.field), (double)placed->code);
@@ -4089,12 +4115,9 @@ static dist_status disti_scene_place(dist_scene *scene, int k, const dist_instan
         square += m[i] * m[i];
     }
     if (square == 0.0) m[0] = m[4] = m[8] = 1.0;
-    double off = disti_rotation_off(m, &determinant);
-    if (off > 1e-3 || determinant < 0.0)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT,
-                          "%s: placement.rotation is not a rotation (rows off orthonormal by %d, determinant %d); see "
-                          "dist_similarity_move",
-                          function, off, determinant);
+    status = disti_rotation_check(ctx, m, "%s: placement.rotation is not a rotation (rows off orthonormal by %d, "
+                                          "determinant %d); see dist_similarity_move", function);
+    if (status != DIST_OK) return status;
     disti_orthonormalize(m);
     next.scale = s->scale > 0.0f ? s->scale : 1.0f;
     next.inverse = 1.0f / next.scale;
@@ -4257,7 +4280,7 @@ DIST_API unsigned long long dist_scene_queries(const dist_scene *scene)
     disti_scene_work w;
     unsigned long long sum = 0;
     for (int worker = 0; scene && worker < scene->ctx->workers; worker++) {
-        disti_scene_layout(scene, scene->scratch + scene->scratch_bytes * (size_t)worker, &w);
+        disti_scene_layout(scene, disti_scene_scratch(scene, worker), &w);
         sum += *w.queries;
     }
     return sum;
@@ -4275,8 +4298,9 @@ static void disti_scene_find_task(void *arg, int index, int worker)
     const disti_scene_job *job = (const disti_scene_job *)arg;
     const dist_scene *scene = job->scene;
     disti_scene_work w;
-    size_t first = (size_t)index * job->pieces.size, end = DISTI_MIN(first + job->pieces.size, job->pieces.n);
-    disti_scene_layout(scene, scene->scratch + scene->scratch_bytes * (size_t)worker, &w);
+    size_t first, end = disti_piece(&job->pieces, index, &first);
+    disti_scene_layout(scene, disti_scene_scratch(scene, worker), &w);
+    end += first;
     for (size_t count = 0; first < end; first += count) {
         count = DISTI_MIN(end - first, (size_t)DISTI_SCENE_CHUNK);
         disti_scene_settle(scene, worker, count, job->points + 3 * first, &w, 1);
@@ -5562,8 +5586,8 @@ static void disti_hidden_delta(const dist_net *net, const disti_kernels *kernels
                     sums[disti_store_out(layer) + u] += delta[u * DISTI_BLOCK + c];
             }
         }
-        kernels->norm_back(layer->out, net->params + layer->norm_weight, (size_t)b->half,
-                           b->hat + (size_t)l * width * DISTI_BLOCK, b->inverse + (size_t)l * DISTI_BLOCK, delta);
+        kernels->norm_back(layer->out, net->params + layer->norm_weight, (size_t)b->half, hat,
+                           b->inverse + (size_t)l * DISTI_BLOCK, delta);
     }
 }
 
@@ -6990,10 +7014,10 @@ typedef struct disti_channels_job {
 static void disti_channels_task(void *arg, int index, int worker)
 {
     const disti_channels_job *job = (const disti_channels_job *)arg;
-    size_t first = (size_t)index * job->pieces.size;
+    size_t first, n = disti_piece(&job->pieces, index, &first);
     int channels = job->shape->net->channels;
-    disti_shape_channels(job->shape, worker, DISTI_MIN(job->pieces.size, job->pieces.n - first),
-                         job->points + 3 * first, 0, channels, job->channels + first * (size_t)channels);
+    disti_shape_channels(job->shape, worker, n, job->points + 3 * first, 0, channels,
+                         job->channels + first * (size_t)channels);
 }
 
 DIST_API dist_status dist_shape_eval(dist_context *ctx, dist_shape *shape, size_t n, const float *points,
@@ -7916,15 +7940,10 @@ static dist_status disti_camera_check(dist_context *ctx, const dist_camera *came
                           0);
     if (!disti_finite_all(9, camera->rotation) || !disti_finite_all(3, camera->translation))
         return disti_fail(ctx, DIST_NOT_FINITE, "%s: camera.rotation and translation must be finite", function, 0, 0);
-    double m[9], determinant;
+    double m[9];
     for (int i = 0; i < 9; i++) m[i] = (double)camera->rotation[i];
-    double off = disti_rotation_off(m, &determinant);
-    if (off > 1e-3 || determinant < 0.0)
-        return disti_fail(
-            ctx, DIST_BAD_ARGUMENT,
-            "%s: camera.rotation is not a rotation (rows off orthonormal by %d, determinant %d); see dist_camera_move",
-            function, off, determinant);
-    return DIST_OK;
+    return disti_rotation_check(ctx, m, "%s: camera.rotation is not a rotation (rows off orthonormal by %d, "
+                                        "determinant %d); see dist_camera_move", function);
 }
 
 /* rows of camera->rotation: right, down, forward */
@@ -12032,10 +12051,9 @@ static void disti_normals_task(void *arg, int index, int worker)
 {
     const disti_normals_job *job = (const disti_normals_job *)arg;
     disti_bench bench;
-    size_t first = (size_t)index * job->pieces.size;
+    size_t first, n = disti_piece(&job->pieces, index, &first);
     disti_bench_init(job->tape->ctx, worker, &bench);
-    disti_normal_gradient(&job->tape->tracer, worker, &bench, DISTI_MIN(job->pieces.size, job->pieces.n - first),
-                          job->tape->hit + 3 * first, job->gradient + 3 * first);
+    disti_normal_gradient(&job->tape->tracer, worker, &bench, n, job->tape->hit + 3 * first, job->gradient + 3 * first);
 }
 
 /* The normals of `count` pixels, at most DISTI_RUN, back to code and weights, to the camera that turns with them, and
@@ -12207,10 +12225,10 @@ DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *ta
     if (d_out->color) status = disti_color_check(ctx, &tape->field, 1, name);
     if (status != DIST_OK) return status;
     memset(&job, 0, sizeof job);
-    size_t code = (size_t)tape->field.code_size, size = code + (size_t)tape->field.color_code_size;
-    if (size + size / DISTI_SLOTS + 1 > ctx->partial_size)
+    size_t size = (size_t)tape->field.code_size + (size_t)tape->field.color_code_size, room = ctx->partial_size - 1;
+    if (size + size / DISTI_SLOTS > room) /* see disti_partial_for */
         return disti_fail(ctx, DIST_UNSUPPORTED, "%s: the field's codes have %d numbers, at most %d here", name,
-                          (double)size, (double)ctx->partial_size - 40.0);
+                          (double)size, (double)(room - room / (DISTI_SLOTS + 1)));
     job.tape = tape;
     job.d_out = d_out;
     job.grads = grads;
@@ -12224,9 +12242,7 @@ DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *ta
     unsigned state = disti_float_state_enter(); /* also for what is not in disti_run */
     if (job.geometry || grads->color_code || grads->color_weights) disti_backward_pixels(&job);
     disti_float_state_leave(state);
-    for (size_t j = 0; grads->code && j < code; j++) disti_add_gradient(&grads->code[j], job.total[j]);
-    for (size_t j = code; grads->color_code && j < size; j++)
-        disti_add_gradient(&grads->color_code[j - code], job.total[j]);
+    disti_codes_add(&tape->field, grads, job.total);
     for (int i = 0; i < 3; i++) {
         if (grads->rotation) disti_add_gradient(&grads->rotation[i], job.rotation[i]);
         if (grads->translation) disti_add_gradient(&grads->translation[i], job.translation[i]);
@@ -12256,31 +12272,47 @@ static double disti_sign(double x)
     return x > 0.0 ? 1.0 : (x < 0.0 ? -1.0 : 0.0);
 }
 
-static int disti_loss_depth_counts(const float *depth, const float *target, const unsigned char *mask, size_t i)
+/* One channel is a depth, three are a color. */
+static int disti_loss_counts(size_t channels, const float *x, const float *target, const unsigned char *mask, size_t i)
 {
-    return disti_loss_hit(mask, i) && disti_finite(target[i]) && target[i] > 0.0f && target[i] < 1e5f &&
-           disti_finite(depth[i]);
+    if (!disti_loss_hit(mask, i) || !disti_finite_all(channels, x + channels * i)) return 0;
+    if (!disti_finite_all(channels, target + channels * i)) return 0;
+    return channels > 1 || (target[i] > 0.0f && target[i] < 1e5f);
 }
 
-/* forward   L = weight / N sum_i |depth_i - target_i|
-   backward  d_depth_i += weight / N sign(depth_i - target_i); 0 at the kink */
-DIST_API float dist_loss_depth(size_t n, const float *depth, const float *target, const unsigned char *mask,
-                               float weight, float *d_depth)
+/* forward   L = weight / N sum_k |x_k - target_k|,  N: numbers of the pixels that count
+   backward  d_x_k += weight / N sign(x_k - target_k); 0 at the kink */
+static float disti_loss_absolute(size_t n, size_t channels, const float *x, const float *target,
+                                 const unsigned char *mask, float weight, float *d_x)
 {
     double sum = 0.0;
     size_t count = 0;
-    if (!depth || !target) return 0.0f;
+    if (!x || !target) return 0.0f;
     for (size_t i = 0; i < n; i++) {
-        if (!disti_loss_depth_counts(depth, target, mask, i)) continue;
-        sum += fabs((double)depth[i] - (double)target[i]);
-        count++;
+        if (!disti_loss_counts(channels, x, target, mask, i)) continue;
+        for (size_t k = channels * i; k < channels * (i + 1); k++) sum += fabs((double)x[k] - (double)target[k]);
+        count += channels;
     }
     if (count == 0) return 0.0f;
     double scale = (double)weight / (double)count;
-    for (size_t i = 0; d_depth && i < n; i++)
-        if (disti_loss_depth_counts(depth, target, mask, i))
-            d_depth[i] += (float)(scale * disti_sign((double)depth[i] - (double)target[i]));
+    for (size_t i = 0; d_x && i < n; i++) {
+        if (!disti_loss_counts(channels, x, target, mask, i)) continue;
+        for (size_t k = channels * i; k < channels * (i + 1); k++)
+            d_x[k] += (float)(scale * disti_sign((double)x[k] - (double)target[k]));
+    }
     return (float)(scale * sum);
+}
+
+DIST_API float dist_loss_depth(size_t n, const float *depth, const float *target, const unsigned char *mask,
+                               float weight, float *d_depth)
+{
+    return disti_loss_absolute(n, 1, depth, target, mask, weight, d_depth);
+}
+
+DIST_API float dist_loss_color(size_t n, const float *color, const float *target, const unsigned char *mask,
+                               float weight, float *d_color)
+{
+    return disti_loss_absolute(n, 3, color, target, mask, weight, d_color);
 }
 
 /* 1 / |target|, or 0 where the pixel does not count. */
@@ -12353,34 +12385,6 @@ DIST_API float dist_loss_silhouette_wrong(size_t n, const float *silhouette, con
                                           float *d_silhouette)
 {
     return disti_loss_silhouette(n, silhouette, target, weight, 1, d_silhouette);
-}
-
-static int disti_loss_color_counts(const float *color, const float *target, const unsigned char *mask, size_t i)
-{
-    return disti_loss_hit(mask, i) && disti_finite_all(3, color + 3 * i) && disti_finite_all(3, target + 3 * i);
-}
-
-/* forward   L = weight / (3 N) sum_i |color_i - target_i|_1
-   backward  d_color_i += weight / (3 N) sign(color_i - target_i); 0 at the kink */
-DIST_API float dist_loss_color(size_t n, const float *color, const float *target, const unsigned char *mask,
-                               float weight, float *d_color)
-{
-    double sum = 0.0;
-    size_t count = 0;
-    if (!color || !target) return 0.0f;
-    for (size_t i = 0; i < n; i++) {
-        if (!disti_loss_color_counts(color, target, mask, i)) continue;
-        for (size_t k = 3 * i; k < 3 * i + 3; k++) sum += fabs((double)color[k] - (double)target[k]);
-        count += 3;
-    }
-    if (count == 0) return 0.0f;
-    double scale = (double)weight / (double)count;
-    for (size_t i = 0; d_color && i < n; i++) {
-        if (!disti_loss_color_counts(color, target, mask, i)) continue;
-        for (size_t k = 3 * i; k < 3 * i + 3; k++)
-            d_color[k] += (float)(scale * disti_sign((double)color[k] - (double)target[k]));
-    }
-    return (float)(scale * sum);
 }
 
 /* forward   L = weight sum_j code_j^2
@@ -13414,8 +13418,7 @@ typedef struct disti_chamfer_job {
 static void disti_chamfer_task(void *arg, int index, int worker)
 {
     const disti_chamfer_job *job = (const disti_chamfer_job *)arg;
-    size_t first = (size_t)index * job->pieces.size, hint = 0;
-    size_t n = DISTI_MIN(job->pieces.size, job->pieces.n - first);
+    size_t first, n = disti_piece(&job->pieces, index, &first), hint = 0;
     double sum = 0.0;
     (void)worker;
     for (size_t i = first; i < first + n; i++) sum += disti_tree_nearest(job->to, job->from->points + 3 * i, &hint);

@@ -111,8 +111,7 @@ typedef struct dist_scheduler {
 
 /* Matrix product of the user's BLAS: C (m, n) = alpha op(A) op(B) + beta C, all row-major, op(X) = X or its transpose;
    lda, ldb, ldc are row strides in floats. Tried on a small product when the context is made; a wrong answer is
-   refused. It may be called from several workers at once. Used for layers at least dist_context_desc.blas_width
-      wide. */
+   refused. May be called from several workers at once. For layers at least dist_context_desc.blas_width wide. */
 typedef struct dist_blas {
     void *user;
     void (*sgemm_fn)(void *user, int transpose_a, int transpose_b, int m, int n, int k, float alpha, const float *a,
@@ -159,6 +158,7 @@ DIST_API void dist_context_destroy(dist_context *ctx);
 DIST_API dist_status dist_context_status(const dist_context *ctx);
 /* Its sentence; "" if there was none. Valid until the context is cleared or destroyed. */
 DIST_API const char *dist_context_message(const dist_context *ctx);
+/* Forgets the failure. Not that of dist_context_create: such a context goes on refusing everything. */
 DIST_API void dist_context_clear(dist_context *ctx);
 /* DIST_ISA_* in force, and its name: "scalar", "sse2", "avx2", "avx512", "neon". */
 DIST_API int dist_context_isa(const dist_context *ctx);
@@ -222,7 +222,7 @@ typedef struct dist_field {
     int kinks;       /* 1: grad f jumps (ReLU), which second_fn leaves out: a normal's gradient is by differences */
     int many;        /* 1: eval_fn is the faster the more points it gets at once, up to thousands */
     int code_size;   /* length of d_code */
-    size_t weight_count;
+    size_t weight_count;       /* length of d_weights; 0: none */
     int color_code_size;       /* length of d_color_code */
     size_t color_weight_count; /* of a color net of its own; 0: the weights of color, if any, are among weight_count */
     dist_context *owner; /* the context that made it; NULL: any */
@@ -300,10 +300,10 @@ typedef struct dist_instance {
 
 /* Several instances as one field: f(p) = min over i of s_i f_i(R_i^T (p - t_i) / s_i). A point asks only the instances
    whose bounding spheres can hold the minimum, nearest first, and none of them outside its sphere: there f_i goes on as
-   a lower bound of the distance, exact up to a fifth of the sphere's radius. how.epsilon's and
-   normal_delta's defaults go by the smallest instance's radius in the world, but are no smaller than float's noise,
-   5e-7 of the scene's. Every point is held against every sphere: fast up to some hundred instances; more
-   are better made scenes of scenes. Belongs to the context that made it. */
+   a lower bound of the distance, exact up to a fifth of the sphere's radius. The defaults
+   of how.epsilon and normal_delta go by the smallest instance's radius in the world, but are no smaller than float's
+   noise, 5e-7 of the scene's. Every point is held against every sphere: fast up to some hundred instances; more are
+   better made scenes of scenes. Belongs to the context that made it. */
 typedef struct dist_scene dist_scene;
 /* NULL on failure. Instances may share fields; a scene's field may be an instance of another scene. */
 DIST_API dist_scene *dist_scene_create(dist_context *ctx, int count, const dist_instance *instances);
@@ -311,10 +311,10 @@ DIST_API void dist_scene_destroy(dist_scene *scene);
 /* Moves an instance or replaces its field (NULL: it stays) by one whose code is as long and that has a color if the old
    one had. No allocator call. Take dist_scene_field again afterwards: the bounding sphere changes. */
 DIST_API dist_status dist_scene_set(dist_scene *scene, int index, const dist_instance *instance);
-/* The scene as a field. Borrows the scene. It has a color if every instance has, with an adjoint if each has one; its
-   color code is theirs one after another. No gradient for weights. Its code
-   are, for each instance, its field's code (nothing if that has no adjoint), then its placement as dist_similarity_move
-   has it: log-scale, w of R' = exp([w]x) R, translation. dist_gradients.code gets the gradients for all of them. */
+/* The scene as a field. Borrows the scene. No gradient for weights. Its code is, for each instance, its field's code
+   (nothing if that has no adjoint), then its placement as dist_similarity_move has it: log-scale, w of R' = exp([w]x) R,
+   translation; dist_gradients.code gets the gradients for all of them. It has a color if every instance has, with an
+   adjoint if each has one; its color code is theirs one after another. */
 DIST_API dist_field dist_scene_field(dist_scene *scene);
 /* Where instance `index` begins in the scene's code; its placement are the seven numbers before instance index + 1.
    index = count: all of them. -1 out of range. */
@@ -349,8 +349,7 @@ DIST_API dist_status dist_net_save_file(dist_context *ctx, const dist_net *net, 
 #endif
 DIST_API void dist_net_destroy(dist_net *net);
 /* Writes what dist_net_load reads; the same net gives the same bytes. *size is set to the bytes needed; with buffer
-   NULL nothing else happens; too small a capacity is refused. Weight norm is folded: plain weights are written, in
-      F32. */
+   NULL nothing else happens; too small a capacity is refused. Written are plain weights, in F32: weight norm is folded. */
 DIST_API dist_status dist_net_save(dist_context *ctx, const dist_net *net, void *buffer, size_t capacity, size_t *size);
 
 enum {
@@ -698,7 +697,7 @@ typedef struct dist_mesh {
     unsigned *triangles; /* (triangle_count, 3) */
     size_t vertex_count;
     size_t triangle_count;
-    struct dist_context *owner;
+    dist_context *owner; /* as the two below: the library's own */
     size_t vertex_capacity, triangle_capacity;
 } dist_mesh;
 
@@ -735,8 +734,8 @@ DIST_API dist_status dist_chamfer(dist_context *ctx, size_t n, const float *a, s
 
 /* ---- 12 files ---------------------------------------------------------------------------------------------------- */
 
-/* PFM: channels 1 or 3, little-endian, bottom row first in the file, top row first in memory. */
-/* *size gets the bytes needed; buffer NULL: only that. */
+/* PFM: channels 1 or 3, little-endian, bottom row first in the file, top row first in memory.
+   *size gets the bytes needed; buffer NULL: only that. */
 DIST_API dist_status dist_pfm_write(dist_context *ctx, int width, int height, int channels, const float *pixels,
                                     void *buffer, size_t capacity, size_t *size);
 /* Reads the header; then, pixels not NULL, the picture into it (capacity in floats). Either byte order. */
@@ -5773,8 +5772,7 @@ static void disti_fold_backward(const dist_shape *shape, disti_block *b, size_t 
     }
 }
 
-/* S += sum_c seed[c] delta[o][c], over the block's own lanes but tangents. seed NULL: ones. index: of
-   the block. */
+/* S += sum_c seed[c] delta[o][c], over the block's own lanes but tangents. seed NULL: ones. index: of the block. */
 static void disti_fold_sum(const dist_shape *shape, disti_block *b, const float *seed, size_t index)
 {
     const dist_net *net = shape->net;
@@ -6735,8 +6733,8 @@ static int disti_groups_pay(const dist_shape *shape, const float *points)
 /* Sampled |grad f| outside the surface: the 4/5 quantile near it, 31/32 beyond disti_far_from, at least 1. What matters
    is not the steepest spot but how far f exceeds the distance, which is its mean slope on the way. Half of the 768
    points are those of a fixed low-discrepancy sequence (the plastic number's) in the bounding sphere, half are these
-   moved along their gradients to a place near the surface. Notes which layers meet no dead unit there,
-   and what 16 bits are off. */
+   moved along their gradients to a place near the surface. Notes which layers meet no dead unit there, and what 16 bits
+   are off. */
 static void disti_shape_slope(dist_shape *shape, const dist_field *field)
 {
     enum { ROUNDS = 16, BINS = 256 };
@@ -10587,8 +10585,7 @@ static void disti_render_budget(const disti_render_job *job, const disti_tile *t
 enum { DISTI_GRADIENTS = 1024 };
 
 /* normal    analytic: G = grad f;  difference: G_i = (f(p + delta e_i) - f(p - delta e_i)) / (2 delta);  n = G / |G|
-   Writes G for n points; the analytic one in one pass, differences in six queries a point. G = 0 where it is not
-      finite. */
+   Writes G for n points, the analytic one in one pass, differences in six queries a point; 0 where it is not finite. */
 static void disti_normal_gradient(const disti_tracer *tracer, int worker, const disti_bench *bench, size_t n,
                                   const float *points, float *gradient)
 {
@@ -11848,9 +11845,8 @@ static void disti_render_seed(void *user, size_t first, size_t count, const floa
     }
 }
 
-/* The one place where a pixel's share reaches the camera. p: a point on a ray,
-    where it is for this camera; y = dL/dp as
-   the camera moves and p keeps its distance t along its ray; d_z: dL/d(z of p in camera space) from elsewhere (depth
+/* The one place where a pixel's share reaches the camera. p: a point on a ray, where it is for this camera; y = dL/dp
+   as the camera moves and p keeps its distance t along its ray; d_z: dL/d(z of p in camera space) from elsewhere (depth
    is t times the unit ray's z), which then only the ray's own tilt changes. In camera space, with Y = R y:
 
    pose        p = R^T (q - translation), q = t l held still: d_rotation -= R p x Y, d_translation -= Y.
@@ -12777,8 +12773,7 @@ DIST_API dist_mesh *dist_mesh_create(dist_context *ctx, size_t vertex_count, con
 }
 
 /* Marching cubes. Corner c of a cell stands at (c & 1, c >> 1 & 1, c >> 2 & 1); bit c of a case is set where the
-   corner is inside, f < level. An edge is axis * 8 + its lower corner. The triangles of a case are derived, not
-      tabulated: */
+   corner is inside, f < level. An edge is axis * 8 + its lower corner. A case's triangles are derived, not tabulated: */
 typedef struct disti_case {
     unsigned char triangles;
     unsigned char edges[3 * 6]; /* six triangles are the most that occur */
@@ -12799,8 +12794,8 @@ static int disti_edges_share_face(int e, int f)
 /* Where the surface goes from a crossed edge. Walking around a face counterclockwise as seen from outside the cell,
    each edge that leaves the inside is joined to the edge where that run of inside corners was entered. The rule
    knows only the face's own corners, so the two cells at a face draw the same segments, in opposite directions; on
-   an ambiguous face it keeps the two inside corners apart. Each crossed edge leaves on one of its faces and enters
-      on the other: closed loops. */
+   an ambiguous face it keeps the two inside corners apart. Each crossed edge leaves on one of its faces and enters on
+   the other: closed loops. */
 static void disti_case_links(int code, unsigned char link[24])
 {
     memset(link, 0xff, 24);
@@ -13726,7 +13721,7 @@ static float disti_narrow(double x)
 
 /* A mesh file while it is read. Counts in it are never believed: every vertex and corner is read before there is
    memory for it, so that memory stays within a small multiple of the file. All functions return 1, or 0 after
-      disti_fail. */
+   disti_fail. */
 typedef struct disti_mesh_text {
     disti_text text;
     const char *begin;
@@ -14268,7 +14263,10 @@ DIST_API size_t dist_workspace_bytes(const dist_workspace_desc *desc)
 #undef DISTI_TARGET
 #undef DISTI_UNUSED
 #undef DISTI_KERNEL
+#undef DISTI_LOOPS
+#undef DISTI_INLINE
 #undef DISTI_X86
+#undef DISTI_HALF
 #undef DISTI_NEON
 #undef DISTI_OPENMP
 #undef DISTI_ALIGNMENT

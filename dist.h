@@ -312,9 +312,9 @@ DIST_API void dist_scene_destroy(dist_scene *scene);
    one had. No allocator call. Take dist_scene_field again afterwards: the bounding sphere changes. */
 DIST_API dist_status dist_scene_set(dist_scene *scene, int index, const dist_instance *instance);
 /* The scene as a field. Borrows the scene. No gradient for weights. Its code is, for each instance, its field's code
-   (nothing if that has no adjoint), then its placement as dist_similarity_move has it: log-scale, w of R' = exp([w]x) R,
-   translation; dist_gradients.code gets the gradients for all of them. It has a color if every instance has, with an
-   adjoint if each has one; its color code is theirs one after another. */
+   (nothing if that has no adjoint), then its placement as dist_similarity_move has it: log-scale, w of
+   R' = exp([w]x) R, translation; dist_gradients.code gets the gradients for all of them. It has a color if every
+   instance has, with an adjoint if each has one; its color code is theirs one after another. */
 DIST_API dist_field dist_scene_field(dist_scene *scene);
 /* Where instance `index` begins in the scene's code; its placement are the seven numbers before instance index + 1.
    index = count: all of them. -1 out of range. */
@@ -349,7 +349,7 @@ DIST_API dist_status dist_net_save_file(dist_context *ctx, const dist_net *net, 
 #endif
 DIST_API void dist_net_destroy(dist_net *net);
 /* Writes what dist_net_load reads; the same net gives the same bytes. *size is set to the bytes needed; with buffer
-   NULL nothing else happens; too small a capacity is refused. Written are plain weights, in F32: weight norm is folded. */
+   NULL nothing else happens; too small a capacity is refused. Plain weights are written, in F32. */
 DIST_API dist_status dist_net_save(dist_context *ctx, const dist_net *net, void *buffer, size_t capacity, size_t *size);
 
 enum {
@@ -12773,7 +12773,7 @@ DIST_API dist_mesh *dist_mesh_create(dist_context *ctx, size_t vertex_count, con
 }
 
 /* Marching cubes. Corner c of a cell stands at (c & 1, c >> 1 & 1, c >> 2 & 1); bit c of a case is set where the
-   corner is inside, f < level. An edge is axis * 8 + its lower corner. A case's triangles are derived, not tabulated: */
+   corner is inside, f < level. An edge is axis * 8 + its lower corner. A case's triangles are derived: */
 typedef struct disti_case {
     unsigned char triangles;
     unsigned char edges[3 * 6]; /* six triangles are the most that occur */

@@ -5480,6 +5480,8 @@ static void disti_hidden(const dist_shape *shape, const disti_kernels *kernels, 
         kernels->activate(net->activation, l == 0 ? net->first_scale : net->scale, out * DISTI_BLOCK, y, slope);
     } else if (!plain) {
         kernels->relu(out, y, mask);
+        for (size_t u = 0; b->columns < DISTI_BLOCK && u < out; u++) /* the others hold what was there before */
+            mask[u] &= ((uint64_t)1 << b->columns) - 1;
     }
     const disti_linear *next = &net->layer[l + 1];
     if (next->point > 0) memcpy(y + out * DISTI_BLOCK, b->point, (size_t)next->point * DISTI_BLOCK * sizeof(float));
@@ -6384,7 +6386,8 @@ static void disti_shape_coarse(void *user, int worker, size_t n, const float *po
         double done = (double)dist_net_operations(net, 1);
         for (int l = 0; l + 1 < net->layers; l++) {
             disti_half_hidden(shape, &kernels, &b, l, &h);
-            done -= (double)(h.steps - h.alive_count) * net->layer[l].prev / DISTI_MAX(h.steps, 1) * h.out;
+            size_t dead = (size_t)(h.steps - h.alive_count) * (size_t)net->layer[l].prev / (size_t)DISTI_MAX(h.steps, 1);
+            done -= (double)dead * h.out; /* whole numbers: sums of any order are the same */
         }
         counter->done += done * (double)count;
         b.values = 1;

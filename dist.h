@@ -10698,9 +10698,9 @@ static float disti_ray_silhouette(const disti_tracer *tracer, const disti_ray *r
     float f = ray->fbest, magnitude = f < 0.0f ? -f : f;
     float epsilon = disti_ray_epsilon(tracer, ray, ray->best);
     if (ray->status == DIST_RAY_NOT_FINITE) return epsilon;
-    if (magnitude > 2e38f) return tracer->lipschitz * field->radius; /* no sample: no more is known than this bound */
     if (disti_ray_is_hit(tracer, ray))
         return DISTI_MIN((tracer->how.trace == DIST_TRACE_PAPER ? f : magnitude) - epsilon, -tiny);
+    if (magnitude > 2e38f) return tracer->lipschitz * field->radius; /* no sample: no more is known than this bound */
     return DISTI_MAX(magnitude - epsilon, tiny);
 }
 

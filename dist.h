@@ -578,7 +578,7 @@ typedef struct dist_images {
     float *distance;       /* along the ray; likewise */
     float *normal;         /* (h, w, 3), unit, outward; 0 at a miss */
     float *silhouette;     /* min |f| along the ray - epsilon, signed: < 0 at a hit, > 0 at a miss */
-    float *color;          /* (h, w, 3) */
+    float *color;          /* (h, w, 3); how.background_color at a miss and where it is not finite */
     unsigned char *mask;   /* 1 hit, 0 not: the authority */
     unsigned char *status; /* DIST_RAY_* */
     float *error;          /* bound on the error of distance, as good as f's slopes are sampled; 0 where that is the
@@ -10666,7 +10666,9 @@ static void disti_render_colors(const disti_render_job *job, int worker, const d
         bench->stats->color_queries += count;
         for (size_t k = 0; k < count; k++) {
             size_t pixel = disti_tile_pixel(tile, bench->index[k]);
-            memcpy(job->out->color + 3 * pixel, color + 3 * k, 3 * sizeof(float));
+            for (size_t c = 0; c < 3; c++) /* a net may overflow */
+                job->out->color[3 * pixel + c] =
+                    disti_finite(color[3 * k + c]) ? color[3 * k + c] : job->tracer->how.background_color[c];
         }
     }
 }

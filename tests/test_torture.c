@@ -651,7 +651,7 @@ static int scene_render(const scene *s, stage *where, planes *p, pulls *g, scene
     if (status == DIST_OK && tape) status = scene_backward(s, ctx, &m.placed, tape, &out, g);
     if (where->memory.requests != requests) note(MEMORY, "requests", (double)requests, (double)where->memory.requests);
     if (status != DIST_OK && !strstr(dist_context_message(ctx), ": ")) note(REFUSED, "status", status, 0);
-    int thick = s->own.shape.kind == SHAPE_SPHERE || s->own.shape.kind == SHAPE_PLANE || s->own.shape.kind == SHAPE_BUMPY;
+    int thick = s->own.code[0] == 0 && (s->own.shape.kind == SHAPE_SPHERE || s->own.shape.kind == SHAPE_BUMPY);
     int ordinary = s->is_net ? !s->half && s->weight_scale == 1 && !s->extreme && s->code_scale < 1
                              : s->instances && s->own.wild == WILD_NONE && !(s->own.shape.poison > 0) &&
                                    s->own.shape.power == 0 && thick && (s->sane || !s->warm);
@@ -901,9 +901,10 @@ TEST(random_scenes_keep_their_word)
        five), a hit of what fell within epsilon but never ended, a bracket with 0 at both ends */
     const unsigned long kept[7] = {1005801, 1005855, 1011869, 50009703, 50010779, 1009082, 900016283};
     for (int i = 0; i < 7 && !only; i++) one_scene(kept[i], 0);
-    /* of those with all that was added: idle lanes counted as alive units, a hit's silhouette without a sample of f */
-    const unsigned long kept_too[2] = {988, 20823};
-    for (int i = 0; i < 2 && !only; i++) one_scene(kept_too[i], 1);
+    /* of those with all that was added: idle lanes counted as alive units, a hit's silhouette without a sample of f, a
+       texture that overflows */
+    const unsigned long kept_too[3] = {988, 20823, 40869};
+    for (int i = 0; i < 3 && !only; i++) one_scene(kept_too[i], 1);
     for (int k = 0; k < FAULTS; k++) {
         CHECK_EQUAL(0, found[k]);
         if (getenv("DIST_TORTURE")) printf("scenes,%s,0,%ld\n", fault_names[k], found[k]);

@@ -766,8 +766,9 @@ static void judge_truth(const scene *s, const planes *p, const scene_field *own)
                rounding = 3e-7 * (fabs(t) + s->radius + fabs(s->center[0]) + fabs(s->center[1]) + fabs(s->center[2]));
         double epsilon = s->how.epsilon > 0 ? (double)s->how.epsilon : 5e-5 * (paper ? 1 : s->radius);
         epsilon = fmax(epsilon, 5e-7 * s->radius);
-        /* a warm hit may be moved as its neighbors are */
-        int wild = own->wild == WILD_HASH || own->wild == WILD_SPIKES || (s->warm && !s->sane);
+        /* a warm hit may be moved as its neighbors are: to about 1e-5 of the radius */
+        int wild = own->wild == WILD_HASH || own->wild == WILD_SPIKES ||
+                   (s->warm && (!s->sane || epsilon < 1e-5 * s->radius));
         if (p->status[i] == DIST_RAY_HIT && !coarse && !wild && !(own->shape.poison > 0)) {
             double e = (double)p->error[i] + rounding;
             double a = value_at(own, o, d, t - e), m = value_at(own, o, d, t), b = value_at(own, o, d, t + e);

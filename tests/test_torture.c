@@ -33,7 +33,8 @@ static unsigned char wanted[MOST];
 
 /* What was found wrong, by kind. */
 enum {
-    REFUSED, ACCEPTED, NOT_FINITE, OVER_BUDGET, COUNTS, FALSE_HIT, FALSE_MISS, BAD_BOUND, THREADS, GRADIENT, MEMORY, FAULTS
+    REFUSED, ACCEPTED, NOT_FINITE, OVER_BUDGET, COUNTS, FALSE_HIT, FALSE_MISS, BAD_BOUND, THREADS, GRADIENT, MEMORY,
+    FAULTS
 };
 static const char *const fault_names[FAULTS] = {"refused without a sentence",
                                               "not finite, but accepted",
@@ -46,10 +47,13 @@ static const char *const fault_names[FAULTS] = {"refused without a sentence",
                                               "bits differ between 1 and 3 workers",
                                               "gradient not finite",
                                               "memory taken while rendering"};
-static long found[FAULTS], shallow_misses, hits_judged, misses_judged, bounds_judged, refusals, expected_refusals, scenes;
+static long found[FAULTS], shallow_misses, hits_judged, misses_judged, bounds_judged, refusals,
+    expected_refusals, scenes;
 /* What was among them. */
-enum { WITH_NET, WITH_MODEL, WITH_WEIGHTS, WITH_TEXTURE, WITH_INSTANCES, WITH_WARM, WITH_SPARSE, WITH_LIMIT, WITH_BAD,
-       WITH_HALF, WITHS };
+enum {
+    WITH_NET, WITH_MODEL, WITH_WEIGHTS, WITH_TEXTURE, WITH_INSTANCES, WITH_WARM, WITH_SPARSE, WITH_LIMIT, WITH_BAD,
+    WITH_HALF, WITHS
+};
 static const char *const with_names[WITHS] = {"nets", "nets from files", "gradients for weights", "textures",
                                               "scenes of instances", "warm tapes", "sparse pixels",
                                               "limited queries", "input that is not finite", "nets in 16 bits"};
@@ -572,7 +576,8 @@ static dist_status scene_backward(const scene *s, dist_context *ctx, const dist_
     d_out.color = out->color ? d_plane + 6 * n : NULL;
     d_out.stats = out->stats;
     dist_status status = dist_render_backward(ctx, tape, &d_out, &grads);
-    if (!all_finite(PULLS, g->code) || !all_finite(PULLS, g->color_code)) note(GRADIENT, "code, scale", scale, s->is_net);
+    if (!all_finite(PULLS, g->code)) note(GRADIENT, "code, scale", scale, s->is_net);
+    if (!all_finite(PULLS, g->color_code)) note(GRADIENT, "color code, scale", scale, s->is_net);
     if (!all_finite(10, g->rotation)) note(GRADIENT, "camera, scale", scale, s->is_net);
     if (!all_finite(2 * WEIGHTS_MOST, g->weights)) note(GRADIENT, "weights, scale", scale, s->is_net);
     with[WITH_WEIGHTS] += grads.weights || grads.color_weights;
@@ -694,10 +699,10 @@ static void judge_counts(const scene *s, const planes *p, const scene_field *own
     if (seen[DIST_RAY_UNRESOLVED] != t->unresolved || seen[DIST_RAY_INSIDE] != t->inside ||
         seen[DIST_RAY_PLATEAU] != t->plateau || seen[DIST_RAY_NOT_FINITE] != t->not_finite)
         note(COUNTS, "statuses", (double)t->unresolved, (double)seen[DIST_RAY_UNRESOLVED]);
-    if (t->queries !=
-        t->cone_queries + t->march_queries + t->refine_queries + t->silhouette_queries + t->normal_queries + t->color_queries)
+    unsigned long long of_f = t->queries - t->color_queries;
+    if (of_f != t->cone_queries + t->march_queries + t->refine_queries + t->silhouette_queries + t->normal_queries)
         note(COUNTS, "queries", (double)t->queries, (double)t->march_queries);
-    if (!s->is_net && !s->instances && s->planes & 64 && (unsigned long long)own->points != t->queries - t->color_queries)
+    if (!s->is_net && !s->instances && s->planes & 64 && (unsigned long long)own->points != of_f)
         note(COUNTS, "points", (double)t->queries, (double)own->points);
     /* the tiles' borders are traced twice; 66: the most a bracket and a prediction may add; cones: 64 rounds each */
     double traced = 1.15 * (double)n + 70;

@@ -6386,8 +6386,8 @@ static void disti_shape_coarse(void *user, int worker, size_t n, const float *po
         double done = (double)dist_net_operations(net, 1);
         for (int l = 0; l + 1 < net->layers; l++) {
             disti_half_hidden(shape, &kernels, &b, l, &h);
-            size_t dead = (size_t)(h.steps - h.alive_count) * (size_t)net->layer[l].prev / (size_t)DISTI_MAX(h.steps, 1);
-            done -= (double)dead * h.out; /* whole numbers: sums of any order are the same */
+            /* whole numbers: sums of any order are the same */
+            done -= (double)((h.steps - h.alive_count) * net->layer[l].prev / DISTI_MAX(h.steps, 1)) * h.out;
         }
         counter->done += done * (double)count;
         b.values = 1;

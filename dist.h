@@ -21,6 +21,8 @@
        dist_images   out; memset(&out, 0, sizeof out); out.depth = depth;     // what is NULL is not computed
        dist_render(ctx, &field, &camera, NULL, &out, NULL);
        if (dist_context_status(ctx) != DIST_OK) puts(dist_context_message(ctx));   // one check at the end is enough
+       dist_shape_destroy(shape), dist_net_destroy(net), dist_context_destroy(ctx); // the context last
+   Built with "cc -O2 app.c -lm"; with -fopenmp (MSVC: /openmp) it uses all cores.
 
    Options, defined before the include:
        DIST_IMPLEMENTATION    the functions themselves, in one file
@@ -221,7 +223,7 @@ typedef struct dist_field {
     float cost;
     int kinks;       /* 1: grad f jumps (ReLU), which second_fn leaves out: a normal's gradient is by differences */
     int many;        /* 1: eval_fn is the faster the more points it gets at once, up to thousands */
-    int code_size;   /* length of d_code */
+    int code_size;   /* length of d_code; for a render's gradient of a field of your own at most 984 */
     size_t weight_count;       /* length of d_weights; 0: none */
     int color_code_size;       /* length of d_color_code */
     size_t color_weight_count; /* of a color net of its own; 0: the weights of color, if any, are among weight_count */
@@ -289,7 +291,7 @@ typedef struct dist_similarity {
 } dist_similarity;
 
 /* scale *= exp(step[0]), rotation <- exp([step[1..3]]x) rotation, kept orthonormal, translation += step[4..6]: the step
-   for a gradient of a placement's seven numbers. */
+   for a gradient of a placement's seven numbers, against it as in dist_camera_move. */
 DIST_API void dist_similarity_move(dist_similarity *placement, const float step[7]);
 
 /* A field and where it stands. */
@@ -344,6 +346,7 @@ enum {
    copied. A file is hostile until proved otherwise: NULL and a sentence for anything that does not fit. */
 DIST_API dist_net *dist_net_load(dist_context *ctx, const void *bytes, size_t size);
 #ifndef DIST_NO_STDIO
+/* A file of at most 2 GB; a sentence about it ends with its path. */
 DIST_API dist_net *dist_net_load_file(dist_context *ctx, const char *path);
 DIST_API dist_status dist_net_save_file(dist_context *ctx, const dist_net *net, const char *path);
 #endif
@@ -448,7 +451,8 @@ DIST_API void dist_camera_get_opengl(const dist_camera *camera, float camera_to_
    A zero quaternion is refused, another length normalized. */
 DIST_API dist_status dist_camera_set_colmap(dist_camera *camera, const float quaternion[4], const float translation[3]);
 DIST_API void dist_camera_get_colmap(const dist_camera *camera, float quaternion[4], float translation[3]);
-/* rotation <- exp([w]x) rotation, kept orthonormal; translation += t. The step for a gradient of dist_gradients. */
+/* rotation <- exp([w]x) rotation, kept orthonormal; translation += t. The step for a gradient of dist_gradients:
+   minus a rate times it, or what dist_adam_step makes of six zeros. */
 DIST_API void dist_camera_move(dist_camera *camera, const float w[3], const float t[3]);
 /* Center of projection -R^T t and unit direction of pixel (x, y), in world coordinates. */
 DIST_API void dist_camera_ray(const dist_camera *camera, float x, float y, float origin[3], float direction[3]);
@@ -487,7 +491,7 @@ typedef struct dist_render_desc {
     float normal_delta;  /* half step of differences, shape units; 0: 1e-3 of the bounding radius or field.detail */
     int normal_space;    /* DIST_SPACE_* */
     int inside;          /* DIST_INSIDE_* */
-    float background;    /* depth and distance at a miss */
+    float background;    /* depth and distance at a miss, finite */
     float background_color[3];
     float lipschitz;     /* 0: the field's */
     float relax_band; /* above 0, with a tape: d_out's color beside the outline says where it is to go, by the rays that
@@ -683,7 +687,7 @@ typedef struct dist_adam {
     int step;      /* steps taken so far */
 } dist_adam;
 /* x (n) moves against gradient (n). A gradient that is not finite leaves its number and moments as they were;
-   returns how many did. */
+   returns how many did: n, all of them, where x, gradient or adam->moments is NULL. */
 DIST_API size_t dist_adam_step(dist_adam *adam, size_t n, float *x, const float *gradient);
 #endif
 
@@ -853,12 +857,23 @@ extern "C" {
     (defined(__GNUC__) || defined(__clang__) || defined(_MSC_VER))
 #define DISTI_X86
 #include <immintrin.h>
-#ifdef _MSC_VER
+#if defined(_MSC_VER) && !defined(__clang__)
 #include <intrin.h>
+#elif defined(_MSC_VER) /* clang-cl's immintrin.h may leave out what its flags do not name */
+#include <smmintrin.h>
+#include <avxintrin.h>
+#include <avx2intrin.h>
+#include <fmaintrin.h>
+#include <avx512fintrin.h>
+#include <avx512bwintrin.h>
+#include <avx512dqintrin.h>
+#include <avx512vlintrin.h>
+#include <avx512vlbwintrin.h>
+#include <avx512vldqintrin.h>
 #endif
 #endif
 /* Older compilers do not know the 16-bit instructions. */
-#if defined(DISTI_X86) && !defined(DIST_NO_HALF) &&                                                                    \
+#if defined(DISTI_X86) && !defined(DIST_NO_HALF) && !defined(_MSC_VER) &&                                              \
     ((defined(__clang__) && __clang_major__ >= 14) || (!defined(__clang__) && defined(__GNUC__) && __GNUC__ >= 12))
 #define DISTI_HALF
 #endif
@@ -1154,7 +1169,7 @@ static void disti_free(dist_context *ctx, void *p, size_t bytes)
 /* r: eax, ebx, ecx, edx */
 static void disti_cpuid(unsigned leaf, unsigned sub, unsigned r[4])
 {
-#ifdef _MSC_VER
+#if defined(_MSC_VER) && !defined(__clang__)
     int v[4];
     __cpuidex(v, (int)leaf, (int)sub);
     for (int i = 0; i < 4; i++) r[i] = (unsigned)v[i];
@@ -1166,7 +1181,7 @@ static void disti_cpuid(unsigned leaf, unsigned sub, unsigned r[4])
 /* The registers that the operating system saves: bits 1 and 2 for ymm, 5 to 7 for zmm and the masks. */
 static unsigned disti_xgetbv(void)
 {
-#ifdef _MSC_VER
+#if defined(_MSC_VER) && !defined(__clang__)
     return (unsigned)_xgetbv(0);
 #else
     unsigned low, high;
@@ -12644,7 +12659,7 @@ DIST_API float dist_loss_photometric(const dist_photo *to, const dist_photo *fro
 DIST_API size_t dist_adam_step(dist_adam *adam, size_t n, float *x, const float *gradient)
 {
     size_t skipped = 0;
-    if (!adam || !adam->moments || !x || !gradient) return 0;
+    if (!adam || !adam->moments || !x || !gradient) return n;
     double rate = adam->rate < 0.0f ? 0.0 : (adam->rate > 0.0f ? (double)adam->rate : 1e-2);
     double beta1 = adam->beta1 > 0.0f && adam->beta1 < 1.0f ? (double)adam->beta1 : 0.9;
     double beta2 = adam->beta2 > 0.0f && adam->beta2 < 1.0f ? (double)adam->beta2 : 0.999;

@@ -11,7 +11,7 @@
 # A program ends with a line "N passed, N failed, N skipped"; a script prints "ok NAME", "not ok NAME: why" or
 # "skip NAME: why" for each test. One that does not end as it should is one more failure.
 
-script_tests="languages options symbols layers source examples results"
+script_tests="languages readme options symbols layers source examples results"
 
 folder=build
 emulator=

@@ -263,6 +263,21 @@ TEST(adam_skips_and_counts_gradients_that_are_not_finite)
     CHECK_NEAR(0.25, moments[4], 0);
 }
 
+TEST(adam_without_its_arrays_says_that_nothing_moved)
+{
+    float x[2] = {1, -2}, g[2] = {1, 1}, moments[4] = {0, 0, 0, 0};
+    dist_adam adam;
+    memset(&adam, 0, sizeof adam);
+    CHECK_EQUAL(2, dist_adam_step(&adam, 2, x, g)); /* moments forgotten */
+    CHECK_EQUAL(2, dist_adam_step(NULL, 2, x, g));
+    adam.moments = moments;
+    CHECK_EQUAL(2, dist_adam_step(&adam, 2, NULL, g));
+    CHECK_EQUAL(2, dist_adam_step(&adam, 2, x, NULL));
+    CHECK_EQUAL(0, adam.step);
+    CHECK_EQUAL(0, dist_adam_step(&adam, 2, x, g));
+    CHECK(x[0] < 1.0f);
+}
+
 TEST(adam_with_a_negative_rate_moves_nothing)
 {
     float x[1] = {1}, g[1] = {5}, moments[2] = {0, 0};
@@ -272,8 +287,6 @@ TEST(adam_with_a_negative_rate_moves_nothing)
     adam.rate = -1.0f;
     dist_adam_step(&adam, 1, x, g);
     CHECK_NEAR(1, x[0], 0);
-    CHECK_EQUAL(0, dist_adam_step(NULL, 1, x, g));
-    CHECK_EQUAL(0, dist_adam_step(&adam, 1, NULL, g));
 }
 
 int main(int argc, char **argv)
@@ -291,6 +304,7 @@ int main(int argc, char **argv)
     RUN(adam_with_zero_gradients_never_moves);
     RUN(adam_stays_finite_for_huge_and_tiny_gradients);
     RUN(adam_skips_and_counts_gradients_that_are_not_finite);
+    RUN(adam_without_its_arrays_says_that_nothing_moved);
     RUN(adam_with_a_negative_rate_moves_nothing);
     return test_report();
 }

@@ -10863,6 +10863,21 @@ static void disti_tile_trim(const disti_render_job *job, disti_tile *tile, const
    expected, and around those of the pixels marched anew (one hit in 128 each turn) that do. */
 enum { DISTI_WARM_HITS = 128, DISTI_WARM_MISSES = 64, DISTI_WARM_MINIMA = 8 };
 
+/* What a ray is asked for: a step of Newton's, how f has changed where it was least, whether that is still a miss (the
+   next stage waits for these three), spheres beside a nearer surface, how close it passes by one, anew, and anew to see
+   whether that is where it was expected (or has been, and that is known). */
+enum {
+    DISTI_ASK_NOTHING,
+    DISTI_ASK_NEWTON,
+    DISTI_ASK_DRIFT,
+    DISTI_ASK_LEAST,
+    DISTI_ASK_BESIDE,
+    DISTI_ASK_NEAR,
+    DISTI_ASK_MARCH,
+    DISTI_ASK_REFRESH,
+    DISTI_ASK_KNOWN
+};
+
 typedef struct disti_warm {
     dist_tape *tape;
     const disti_tracer *tracer;
@@ -10872,8 +10887,11 @@ typedef struct disti_warm {
     float *moved;         /* of each pixel: how far its hit has moved; 3e38: not known */
     float *drift;         /* of each miss, with a silhouette: how its least f has changed; 3e38: not known */
     unsigned char *open;  /* 1: not decided by the cones; 2: and its hit was not where it was looked for */
+    unsigned char *ask;   /* DISTI_ASK_* */
     float change, mean;   /* largest change of f in the tile, no less than its mean over the picture */
-    size_t count;         /* of bench->index */
+    float typical;        /* mean change of f at every 8th hit */
+    int due, late;        /* all least |f| are looked for anew; neighbors are known as far as they will be */
+    size_t count, awaited; /* of bench->index; of these, with the first three DISTI_ASK_* */
 } disti_warm;
 
 static size_t disti_warm_pixel(const disti_warm *warm, int i)
@@ -10912,7 +10930,17 @@ static void disti_warm_change(disti_warm *warm, float change)
     warm->change = DISTI_MAX(warm->change, change < 0.0f ? -change : change);
 }
 
-static void disti_warm_again(disti_warm *warm, int i)
+/* Lists ray i to be asked at q. */
+static void disti_warm_list(disti_warm *warm, int i, int ask, float q)
+{
+    warm->bench->rays[i].q = q;
+    warm->ask[i] = (unsigned char)ask;
+    warm->bench->index[warm->count++] = i;
+    warm->awaited += ask <= DISTI_ASK_LEAST;
+}
+
+/* Ray i is to be traced anew; once its neighbors are known at once and from what they found: 1. */
+static int disti_warm_again(disti_warm *warm, int i)
 {
     disti_ray *ray = &warm->bench->rays[i];
     ray->status = DIST_RAY_MISS;
@@ -10922,8 +10950,12 @@ static void disti_warm_again(disti_warm *warm, int i)
     ray->fb = ray->slope = ray->error = 0.0f;
     ray->steps = 0;
     ray->kept = 0;
+    warm->bench->depth[i] = 0.0f;
     warm->moved[i] = 3e38f;
     warm->open[i] = 2;
+    warm->ask[i] = DISTI_ASK_MARCH;
+    if (!warm->late) return 0;
+    return disti_predict(warm->tracer, warm->tile, warm->bench, i % warm->tile->width, i / warm->tile->width, 1);
 }
 
 static void disti_warm_hit(disti_warm *warm, int i, float s, float f, float error)
@@ -10931,48 +10963,33 @@ static void disti_warm_hit(disti_warm *warm, int i, float s, float f, float erro
     disti_ray *ray = &warm->bench->rays[i];
     disti_ray_end(ray, DIST_RAY_HIT, s, f, error);
     ray->kept = 1;
+    warm->bench->depth[i] = disti_hit_depth(ray);
     warm->moved[i] = s - warm->tape->s[disti_warm_pixel(warm, i)];
 }
 
-/* Newton's steps for the rays of bench->index, from ray->q with the last slope, then with their own. What does not end
-   within four is left to be traced. */
-static void disti_warm_newton(disti_warm *warm)
+/* The sample f of a step of Newton's, the first with the last slope, then with the ray's own. What does not end within
+   four is traced anew. */
+static int disti_warm_newton(disti_warm *warm, int i, float f)
 {
-    const disti_bench *bench = warm->bench;
+    disti_ray *ray = &warm->bench->rays[i];
     float far = 0.03f * warm->tracer->field->radius, flat = -2e-3f * warm->tracer->lipschitz;
-    for (int round = 0; round < 4 && warm->count > 0; round++) {
-        size_t count = warm->count;
-        for (size_t k = 0; k < count; k++) {
-            const disti_ray *ray = &bench->rays[bench->index[k]];
-            disti_ray_point(ray, ray->q, bench->points + 3 * k);
-        }
-        size_t asked = disti_query(warm->tracer, warm->worker, bench, count);
-        bench->stats->refine_queries += asked;
-        warm->count = 0;
-        for (size_t k = 0; k < count; k++) {
-            int i = bench->index[k];
-            disti_ray *ray = &bench->rays[i];
-            float f = k < asked ? bench->sdf[k] : 3e38f, epsilon = disti_ray_epsilon(warm->tracer, ray, ray->q);
-            float slope = round == 0 ? ray->slope : (f - ray->fa) / (ray->q - ray->a), step = -f / slope;
-            float length = step < 0.0f ? -step : step, moved = ray->q + step - warm->tape->s[disti_warm_pixel(warm, i)];
-            int good = disti_finite(step) && slope < flat && length < far && moved < far && moved > -far &&
-                       (round == 0 || f * f < ray->fa * ray->fa) && ray->q + step > ray->enter;
-            ray->fa = f;
-            ray->slope = slope;
-            ray->a = ray->q;
-            ray->q += step;
-            int steep = slope < -0.3f * warm->tracer->lipschitz;
-            if (good && length <= (round > 0 ? 12.0f : steep ? 8.0f : 4.0f) * epsilon) {
-                disti_warm_hit(warm, i, ray->q, f, 2.0f * length - warm->tracer->noise / slope);
-                disti_warm_change(warm, moved * slope);
-            } else if (good && round < 3) {
-                bench->index[warm->count++] = i;
-            } else {
-                disti_warm_again(warm, i);
-            }
-        }
+    float epsilon = disti_ray_epsilon(warm->tracer, ray, ray->q);
+    int first = ray->steps++ == 0, steep;
+    float slope = first ? ray->slope : (f - ray->fa) / (ray->q - ray->a), step = -f / slope;
+    float length = step < 0.0f ? -step : step, moved = ray->q + step - warm->tape->s[disti_warm_pixel(warm, i)];
+    int good = disti_finite(step) && slope < flat && length < far && moved < far && moved > -far &&
+               (first || f * f < ray->fa * ray->fa) && ray->q + step > ray->enter;
+    ray->fa = f;
+    ray->slope = slope;
+    ray->a = ray->q;
+    ray->q += step;
+    steep = slope < -0.3f * warm->tracer->lipschitz;
+    if (good && length <= (!first ? 12.0f : steep ? 8.0f : 4.0f) * epsilon) {
+        disti_warm_hit(warm, i, ray->q, f, 2.0f * length - warm->tracer->noise / slope);
+        disti_warm_change(warm, moved * slope);
+        return 0;
     }
-    warm->count = 0;
+    return good && ray->steps < 4 ? 1 : disti_warm_again(warm, i);
 }
 
 /* Where f changes alike, hits move by that over their slopes: how much more i moves than k. Else (`slopes` 0) alike. */
@@ -11044,54 +11061,53 @@ static float disti_warm_between(const disti_warm *warm, const float *moves, int 
     return mean;
 }
 
-/* The hits: every 8th, the quarter that is asked, the others, which have moved as those around have, or as f changed
-   there over their own slope. 0: much has moved. */
-static int disti_warm_hits(disti_warm *warm)
+/* The hits: every 8th (pass 0), the quarter that is asked, the others, which have moved as those around have, or as f
+   changed there over their own slope. */
+static void disti_warm_hits(disti_warm *warm, int pass)
 {
-    size_t tried = 0, good = 0;
-    float sum = 0.0f, mean = 0.0f; /* of how f changed */
-    for (int pass = 0; pass < 3; pass++) {
-        for (int i = 0; i < warm->n; i++) {
-            int x = i % warm->tile->width, y = i / warm->tile->width;
-            if (pass == 0 ? (x | y) & 7 : disti_warm_asks(warm, x, y) == (pass == 2)) continue;
-            size_t pixel = disti_warm_pixel(warm, i);
-            float spread = 3e38f, wide = 3e38f, s = warm->tape->s[pixel], move = 0.0f;
-            if (!(warm->tape->value[pixel] < -2e-3f * warm->tracer->lipschitz)) continue; /* as disti_warm_expects */
-            for (int slopes = 0; slopes < 2 && pass > 0; slopes++) { /* the one by which the neighbors differ less */
-                float apart = 3e38f, *least = &spread, other = 3e38f;
-                if (pass == 2) other = disti_warm_between(warm, warm->moved, slopes, i, &apart);
-                if (apart > 2e38f && spread > 2e38f) {
-                    other = disti_warm_guess(warm, warm->moved, slopes, i, &apart);
-                    least = &wide;
-                }
-                if (slopes && !(apart < *least)) continue;
-                move = other;
-                *least = apart;
+    for (int i = 0; i < warm->n; i++) {
+        int x = i % warm->tile->width, y = i / warm->tile->width;
+        if (pass == 0 ? (x | y) & 7 : disti_warm_asks(warm, x, y) == (pass == 2)) continue;
+        size_t pixel = disti_warm_pixel(warm, i);
+        float spread = 3e38f, wide = 3e38f, s = warm->tape->s[pixel], move = 0.0f;
+        if (!(warm->tape->value[pixel] < -2e-3f * warm->tracer->lipschitz)) continue; /* as disti_warm_expects */
+        for (int slopes = 0; slopes < 2 && pass > 0; slopes++) { /* the one by which the neighbors differ less */
+            float apart = 3e38f, *least = &spread, other = 3e38f;
+            if (pass == 2) other = disti_warm_between(warm, warm->moved, slopes, i, &apart);
+            if (apart > 2e38f && spread > 2e38f) {
+                other = disti_warm_guess(warm, warm->moved, slopes, i, &apart);
+                least = &wide;
             }
-            if (move > 2e38f) move = 0.0f;
-            if (!disti_warm_expects(warm, i, s + move) || disti_warm_due(warm, i, DISTI_WARM_HITS)) continue;
-            disti_ray *ray = &warm->bench->rays[i];
-            float epsilon = disti_ray_epsilon(warm->tracer, ray, s);
-            ray->slope = warm->tape->value[pixel];
-            ray->q = s + move;
-            unsigned other = ((unsigned)(x / 2 + y / 2) + warm->tape->turn / 4u) & 3u;
-            if (pass == 1 && wide <= epsilon && other != 0) spread = wide;
-            float error = 8.0f * epsilon + 2.0f * spread - 3.0f * mean / ray->slope; /* amid others at a crease */
-            if (spread <= 5.0f * epsilon) disti_warm_hit(warm, i, ray->q, 0.0f, error);
-            else warm->bench->index[warm->count++] = i;
+            if (slopes && !(apart < *least)) continue;
+            move = other;
+            *least = apart;
         }
-        if (pass == 0) tried = warm->count;
-        disti_warm_newton(warm);
-        for (int i = 0; i < warm->n && pass == 0; i++) {
-            if (warm->moved[i] > 2e38f) continue;
-            float change = warm->moved[i] * warm->tape->value[disti_warm_pixel(warm, i)];
-            sum += change < 0.0f ? -change : change;
-            good++;
-        }
-        mean = good > 0 ? sum / (float)good : 0.0f;
-        if (4 * good < 3 * tried || sum > 8e-3f * warm->tracer->field->radius * (float)good) return 0;
+        if (move > 2e38f) move = 0.0f;
+        if (!disti_warm_expects(warm, i, s + move) || disti_warm_due(warm, i, DISTI_WARM_HITS)) continue;
+        disti_ray *ray = &warm->bench->rays[i];
+        float epsilon = disti_ray_epsilon(warm->tracer, ray, s);
+        ray->slope = warm->tape->value[pixel];
+        unsigned other = ((unsigned)(x / 2 + y / 2) + warm->tape->turn / 4u) & 3u;
+        if (pass == 1 && wide <= epsilon && other != 0) spread = wide;
+        float error = 8.0f * epsilon + 2.0f * spread - 3.0f * warm->typical / ray->slope; /* amid others at a crease */
+        if (spread <= 5.0f * epsilon) disti_warm_hit(warm, i, s + move, 0.0f, error);
+        else disti_warm_list(warm, i, DISTI_ASK_NEWTON, s + move);
     }
-    return 1;
+}
+
+/* Whether most of the `tried` first hits were found, and f has changed little there. */
+static int disti_warm_good(disti_warm *warm, size_t tried)
+{
+    size_t good = 0;
+    float sum = 0.0f;
+    for (int i = 0; i < warm->n; i++) {
+        if (warm->moved[i] > 2e38f) continue;
+        float change = warm->moved[i] * warm->tape->value[disti_warm_pixel(warm, i)];
+        sum += change < 0.0f ? -change : change;
+        good++;
+    }
+    warm->typical = good > 0 ? sum / (float)good : 0.0f;
+    return 4 * good >= 3 * tried && warm->typical <= 8e-3f * warm->tracer->field->radius;
 }
 
 /* Whether it is the tile's turn to have all of its least |f| looked for anew, in 2 to 8 turns: before the picture has
@@ -11150,48 +11166,18 @@ static int disti_warm_pass(const disti_warm *warm, disti_ray *ray, float f, floa
     return disti_ray_ask(ray, DISTI_WAIT, ray->s - ray->width);
 }
 
-/* The first `count` rays of bench->index pass close by a surface or run into it: from ray->s, f on. Those with
-   ray->moved have another end already, which stands if they pass. */
-static void disti_warm_near(disti_warm *warm, size_t count)
+/* Ray i passes close by a surface or runs into it: from ray->s, f on. With ray->moved it has another end already, which
+   stands if it passes. */
+static int disti_warm_approach(disti_warm *warm, int i)
 {
-    const disti_bench *bench = warm->bench;
-    size_t asked = 0;
-    for (int round = 0; count > 0; round++) {
-        size_t kept = 0;
-        for (size_t k = 0; k < count; k++) {
-            int i = bench->index[k], more;
-            disti_ray *ray = &bench->rays[i];
-            float f = round == 0 ? ray->f : bench->sdf[k];
-            float least = 2.0f * disti_ray_epsilon(warm->tracer, ray, ray->s) + 0.1f * warm->change;
-            if (round == 0) {
-                ray->width = DISTI_MAX(f, 2e-3f * warm->tracer->field->radius);
-                ray->side = 0;
-                ray->steps = 0;
-                ray->q = ray->s;
-                more = f <= 0.0f ? disti_warm_pass(warm, ray, f, least)
-                                 : disti_ray_ask(ray, DISTI_WAIT, DISTI_MAX(ray->s - ray->width, ray->enter));
-            } else if (k >= asked || !disti_finite(f)) {
-                more = -1;
-            } else if (ray->mode == DISTI_WAIT) {
-                more = disti_warm_pass(warm, ray, f, least);
-            } else {
-                more = disti_ray_advance(warm->tracer, ray, f);
-            }
-            if (more > 0) {
-                bench->index[kept] = i;
-                disti_ray_point(ray, ray->q, bench->points + 3 * kept++);
-                continue;
-            }
-            if (more < 0) disti_warm_again(warm, i);
-            else if (ray->mode != DISTI_WAIT) warm->moved[i] = 3e38f;
-            else if (!ray->moved) disti_ray_end(ray, DIST_RAY_MISS, ray->s, ray->f, 0.0f);
-            else ray->mode = DISTI_DONE, warm->tape->beside[disti_warm_pixel(warm, i)] = ray->f;
-            ray->kept = more == 0;
-        }
-        count = kept;
-        asked = disti_query(warm->tracer, warm->worker, bench, count);
-        bench->stats->refine_queries += asked;
-    }
+    disti_ray *ray = &warm->bench->rays[i];
+    warm->ask[i] = DISTI_ASK_NEAR;
+    ray->width = DISTI_MAX(ray->f, 2e-3f * warm->tracer->field->radius);
+    ray->side = 0;
+    ray->steps = 0;
+    ray->q = ray->s;
+    return ray->f <= 0.0f ? disti_warm_pass(warm, ray, ray->f, 0.0f)
+                          : disti_ray_ask(ray, DISTI_WAIT, DISTI_MAX(ray->s - ray->width, ray->enter));
 }
 
 /* Whether the tape's miss of ray i still stands if f was positive where it is least: no cone says otherwise. */
@@ -11222,39 +11208,25 @@ static float disti_warm_drift(const disti_warm *warm, int i, int h, float f)
 }
 
 /* With a silhouette: how the least |f| of each miss has changed. f is asked for where it was least, at every 8th pixel,
-   where f is below .05 radii at every 4th, below .02 at a quarter of them in turn; between these the change is
-   interpolated. To first order f changes there as its least does (envelope theorem). */
-static void disti_warm_drifts(disti_warm *warm)
+   where f is below .05 radii at every 4th, below .02 at a quarter of them in turn; between these (h = 8, 4, 2, 1) the
+   change is interpolated. To first order f changes there as its least does (envelope theorem). */
+static void disti_warm_drifts(disti_warm *warm, int h)
 {
-    const disti_bench *bench = warm->bench;
     const dist_field *field = warm->tracer->field;
     float clamp = 1.5f * (field->clamp > 0.0f ? field->clamp : 0.1f * field->radius), far = 0.05f * field->radius;
-    for (int h = 8; h >= 1; h /= 2) {
-        size_t count = 0;
-        for (int i = 0; i < warm->n; i++) {
-            size_t pixel = disti_warm_pixel(warm, i);
-            const disti_ray *ray = &bench->rays[i];
-            int x = i % warm->tile->width, y = i / warm->tile->width, asks = disti_warm_asks(warm, x, y);
-            float f = warm->tape->value[pixel], drift = 3e38f, spread = 3e38f;
-            if (warm->drift[i] < 2e38f || !disti_warm_misses_still(warm, i)) continue;
-            if (h > 2 ? !disti_silhouette_node(warm->tile, x, y, h) : h == 2 && (!asks || f > far)) continue;
-            if (h == 8 && f > clamp && ((unsigned)((x ^ y) / 8) + warm->tape->turn) % 4u != 0) drift = 0.0f;
-            if (h < 8 && f > far) drift = disti_warm_drift(warm, i, 8, f);
-            if (h < 4 && f > 0.4f * far && drift > 2e38f) drift = disti_warm_drift(warm, i, 4, f);
-            if (h == 1 && drift > 2e38f) drift = disti_warm_between(warm, warm->drift, 0, i, &spread);
-            if (spread < 2e38f && !(spread < DISTI_MAX(0.25f * warm->change, 3e-3f * f))) drift = 3e38f;
-            warm->drift[i] = drift;
-            if (drift < 2e38f) continue;
-            disti_ray_point(ray, warm->tape->s[pixel], bench->points + 3 * count);
-            bench->index[count++] = i;
-        }
-        size_t asked = disti_silhouette_eval(warm->tracer, warm->worker, bench, count);
-        for (size_t k = 0; k < asked; k++) {
-            int i = bench->index[k];
-            float value = warm->tape->value[disti_warm_pixel(warm, i)];
-            warm->drift[i] = disti_finite(bench->sdf[k]) ? bench->sdf[k] - value : 3e38f;
-            if (value > bench->sdf[k] && value < 0.4f * far) disti_warm_change(warm, warm->drift[i]);
-        }
+    for (int i = 0; i < warm->n && warm->silhouette && !warm->due; i++) {
+        size_t pixel = disti_warm_pixel(warm, i);
+        int x = i % warm->tile->width, y = i / warm->tile->width, asks = disti_warm_asks(warm, x, y);
+        float f = warm->tape->value[pixel], drift = 3e38f, spread = 3e38f;
+        if (warm->drift[i] < 2e38f || !disti_warm_misses_still(warm, i)) continue;
+        if (h > 2 ? !disti_silhouette_node(warm->tile, x, y, h) : h == 2 && (!asks || f > far)) continue;
+        if (h == 8 && f > clamp && ((unsigned)((x ^ y) / 8) + warm->tape->turn) % 4u != 0) drift = 0.0f;
+        if (h < 8 && f > far) drift = disti_warm_drift(warm, i, 8, f);
+        if (h < 4 && f > 0.4f * far && drift > 2e38f) drift = disti_warm_drift(warm, i, 4, f);
+        if (h == 1 && drift > 2e38f) drift = disti_warm_between(warm, warm->drift, 0, i, &spread);
+        if (spread < 2e38f && !(spread < DISTI_MAX(0.25f * warm->change, 3e-3f * f))) drift = 3e38f;
+        warm->drift[i] = drift;
+        if (drift > 2e38f) disti_warm_list(warm, i, DISTI_ASK_DRIFT, warm->tape->s[pixel]);
     }
 }
 
@@ -11280,161 +11252,200 @@ static float disti_warm_loss(const disti_warm *warm, int i, float s)
    known by disti_warm_drifts. Where it may be near 0 it is asked for, and looked at on both sides. */
 static void disti_warm_misses(disti_warm *warm)
 {
-    const disti_bench *bench = warm->bench;
-    const dist_field *field = warm->tracer->field;
-    int due = warm->silhouette && disti_warm_minima_due(warm, warm->mean);
-    size_t count = 0, near = 0;
-    int slow = !warm->silhouette && warm->change < 5e-4f * field->radius;
-    for (int i = 0; i < warm->n; i++) warm->drift[i] = 3e38f;
-    if (warm->silhouette && !due) disti_warm_drifts(warm);
     for (int i = 0; i < warm->n; i++) {
         size_t pixel = disti_warm_pixel(warm, i);
-        disti_ray *ray = &bench->rays[i];
+        disti_ray *ray = &warm->bench->rays[i];
         int blocked = ray->mode != DISTI_DONE, inside = warm->tape->status[pixel] & 15;
-        float sunk = warm->tape->value[pixel] + warm->change; /* f at the entry: below 0, the ray still starts inside */
+        float f = warm->tape->value[pixel], sunk = f + warm->change; /* at the entry: below 0, it still starts inside */
         if (inside == DIST_RAY_INSIDE && !warm->silhouette && blocked && !(ray->start > ray->enter) &&
             sunk < -warm->tracer->noise) {
             disti_ray_end(ray, DIST_RAY_INSIDE, ray->enter, sunk, 0.0f);
             ray->kept = 1;
             continue;
         }
-        if ((due && !blocked) || !disti_warm_misses_still(warm, i)) continue;
-        float f = warm->tape->value[pixel], epsilon = disti_ray_epsilon(warm->tracer, ray, ray->start);
+        if ((warm->due && !blocked) || !disti_warm_misses_still(warm, i)) continue;
+        float epsilon = disti_ray_epsilon(warm->tracer, ray, ray->start);
         float unsure = warm->silhouette ? 1.5f * warm->change : disti_warm_loss(warm, i, warm->tape->s[pixel]);
-        float lower = warm->silhouette && !due ? f + warm->drift[i] : f - unsure;
+        float lower = warm->silhouette && !warm->due ? f + warm->drift[i] : f - unsure;
         ray->best = warm->tape->s[pixel];
         ray->moved = 0;
         if (lower > 2e38f) continue;
-        if (blocked && (due || lower < unsure + 3.0f * epsilon)) {
-            disti_ray_point(ray, ray->best, bench->points + 3 * count);
-            bench->index[count++] = i;
+        if (blocked && (warm->due || lower < unsure + 3.0f * epsilon)) {
+            disti_warm_list(warm, i, DISTI_ASK_LEAST, ray->best);
         } else {
             disti_ray_end(ray, DIST_RAY_MISS, ray->best, DISTI_MAX(lower, 0.0f), 0.0f);
             ray->kept = 1;
         }
     }
-    count = disti_query(warm->tracer, warm->worker, bench, count);
-    *(warm->silhouette ? &bench->stats->silhouette_queries : &bench->stats->refine_queries) += count;
-    for (size_t k = 0; k < count; k++) {
-        float value = warm->tape->value[disti_warm_pixel(warm, bench->index[k])]; /* 0: not measured */
-        if (value > bench->sdf[k]) disti_warm_change(warm, value - bench->sdf[k]);
-    }
-    for (size_t k = 0; k < count; k++) {
-        int i = bench->index[k];
-        disti_ray *ray = &bench->rays[i];
-        float f = bench->sdf[k], epsilon = disti_ray_epsilon(warm->tracer, ray, ray->best);
-        float margin = 5.0f * (warm->change + epsilon); /* without a silhouette the bound is used up: a new one */
-        float value = warm->tape->value[disti_warm_pixel(warm, i)];
-        int bounded = warm->silhouette && value > 0.0f;
-        if (!bounded) margin += 0.03f * field->radius;
-        ray->fbest = ray->f = f;
-        ray->s = ray->best;
-        int odd = (i + i / warm->tile->width + (int)warm->tape->turn) & 1, still = slow && odd && value > 0.0f;
-        if (f > margin) {
-            disti_ray_end(ray, DIST_RAY_MISS, ray->best, warm->silhouette ? f : 0.5f * f, 0.0f);
-            ray->kept = !due;
-        } else if (still && f > 3.0f * epsilon) {
-            disti_ray_end(ray, DIST_RAY_MISS, ray->best, f, 0.0f);
-            ray->kept = 1;
-        } else if (f > 0.0f || warm->open[i]) {
-            bench->index[near++] = i;
-        }
-    }
-    disti_warm_near(warm, near);
 }
 
 /* What lies beside another surface, hits that have a nearer one beside them and misses, may be covered by that: spheres
-   from its distance on until f rises again or is what the hit alone makes it; what they get close to is looked at. */
-static void disti_warm_beside(disti_warm *warm)
+   from its distance on until f rises again or is what the hit alone makes it; what they get close to is looked at.
+   1: ray i is to be asked. fresh: for the first time this turn. */
+static int disti_warm_beside(disti_warm *warm, int i, int fresh)
+{
+    disti_ray *ray = &warm->bench->rays[i];
+    float s = warm->tape->nearest[disti_warm_pixel(warm, i)], *bound = &warm->tape->beside[disti_warm_pixel(warm, i)];
+    warm->ask[i] = DISTI_ASK_NOTHING;
+    if (s > 2e38f) return 0;
+    float loss = disti_warm_loss(warm, i, s);
+    if (fresh) *bound = DISTI_MAX(*bound - loss, 0.0f);
+    if (*bound > 0.5f * loss + disti_ray_epsilon(warm->tracer, ray, s)) return 0;
+    int hit = warm->moved[i] < 2e38f && s < ray->best, miss = ray->status == DIST_RAY_MISS && ray->kept;
+    miss &= (i % warm->tile->width + i / warm->tile->width + (int)(warm->tape->turn & 1u)) & 1;
+    if (!warm->open[i] || ray->mode != DISTI_DONE || !(hit || miss) || s <= ray->start || s >= ray->leave) return 0;
+    ray->q = s;
+    ray->f = 3e38f;
+    ray->moved = 1;
+    ray->steps = 0;
+    warm->ask[i] = DISTI_ASK_BESIDE;
+    return 1;
+}
+
+/* One sample f of a miss where it was least. */
+static int disti_warm_least(disti_warm *warm, int i, float f)
+{
+    disti_ray *ray = &warm->bench->rays[i];
+    float epsilon = disti_ray_epsilon(warm->tracer, ray, ray->best), radius = warm->tracer->field->radius;
+    float margin = 5.0f * (warm->change + epsilon), value = warm->tape->value[disti_warm_pixel(warm, i)];
+    int odd = (i + i / warm->tile->width + (int)warm->tape->turn) & 1;
+    int still = !warm->silhouette && warm->change < 5e-4f * radius && odd && value > 0.0f && f > 3.0f * epsilon;
+    if (!(warm->silhouette && value > 0.0f)) margin += 0.03f * radius; /* the bound is used up: a new one */
+    ray->f = f;
+    ray->s = ray->best;
+    if (!(f > margin) && !still) return disti_warm_approach(warm, i);
+    disti_ray_end(ray, DIST_RAY_MISS, ray->best, warm->silhouette || !(f > margin) ? f : 0.5f * f, 0.0f);
+    ray->kept = !(f > margin && warm->due);
+    return disti_warm_beside(warm, i, 0);
+}
+
+/* One of the spheres beside a nearer surface. */
+static int disti_warm_sphere(disti_warm *warm, int i, float f)
+{
+    disti_ray *ray = &warm->bench->rays[i];
+    int hit = ray->status == DIST_RAY_HIT, more;
+    float epsilon = disti_ray_epsilon(warm->tracer, ray, ray->q), before = ray->f;
+    float away = hit ? 0.5f * warm->change + 2.0f * epsilon : 0.03f * warm->tracer->field->radius;
+    ray->f = f;
+    ray->s = ray->q;
+    if (!(f > away) || ray->steps++ > 16) return disti_warm_approach(warm, i);
+    more = hit && f < before && f < -0.7f * ray->slope * (ray->best - ray->q);
+    if (!more) warm->tape->beside[disti_warm_pixel(warm, i)] = 0.5f * DISTI_MIN(f, before); /* this sphere, and those before */
+    ray->q += f / warm->tracer->lipschitz;
+    return more;
+}
+
+/* A sample of a ray that passes close by a surface. */
+static int disti_warm_near(disti_warm *warm, int i, float f)
+{
+    disti_ray *ray = &warm->bench->rays[i];
+    float least = 2.0f * disti_ray_epsilon(warm->tracer, ray, ray->s) + 0.1f * warm->change;
+    int more = ray->mode == DISTI_WAIT ? disti_warm_pass(warm, ray, f, least) : disti_ray_advance(warm->tracer, ray, f);
+    if (more > 0) return 1;
+    if (more < 0) return disti_warm_again(warm, i);
+    ray->kept = 1;
+    if (ray->mode != DISTI_WAIT) {
+        warm->moved[i] = 3e38f;
+        warm->bench->depth[i] = disti_hit_depth(ray);
+    } else if (ray->moved) {
+        ray->mode = DISTI_DONE;
+        warm->tape->beside[disti_warm_pixel(warm, i)] = ray->f;
+    } else {
+        disti_ray_end(ray, DIST_RAY_MISS, ray->s, ray->f, 0.0f);
+        return disti_warm_beside(warm, i, 0);
+    }
+    return 0;
+}
+
+static void disti_warm_drifted(disti_warm *warm, int i, float f)
+{
+    float value = warm->tape->value[disti_warm_pixel(warm, i)];
+    if (!disti_finite(f)) return;
+    warm->drift[i] = f - value;
+    if (value > f && value < 0.02f * warm->tracer->field->radius) disti_warm_change(warm, value - f);
+}
+
+/* One sample f of ray i. 1: another query. */
+static int disti_warm_take(disti_warm *warm, int i, float f)
 {
     const disti_bench *bench = warm->bench;
-    size_t count = 0, close = 0;
-    int *near = (int *)(void *)(warm->open + 2 * DISTI_TILE * DISTI_TILE);
-    for (int i = 0; i < warm->n; i++) {
-        disti_ray *ray = &bench->rays[i];
-        float s = warm->tape->nearest[disti_warm_pixel(warm, i)];
-        float *bound = &warm->tape->beside[disti_warm_pixel(warm, i)];
-        if (s > 2e38f) continue;
-        float loss = disti_warm_loss(warm, i, s);
-        *bound = DISTI_MAX(*bound - loss, 0.0f);
-        if (*bound > 0.5f * loss + disti_ray_epsilon(warm->tracer, ray, s)) continue;
-        int hit = warm->moved[i] < 2e38f && s < ray->best, miss = ray->status == DIST_RAY_MISS && ray->kept;
-        miss &= (i % warm->tile->width + i / warm->tile->width + (int)(warm->tape->turn & 1u)) & 1;
-        if (!warm->open[i] || ray->mode != DISTI_DONE || !(hit || miss) || s <= ray->start || s >= ray->leave) continue;
-        ray->q = s;
-        ray->f = 3e38f;
-        ray->moved = 1;
-        bench->index[count++] = i;
+    disti_ray *ray = &bench->rays[i];
+    int ask = warm->ask[i];
+    if (ask == DISTI_ASK_DRIFT) {
+        disti_warm_drifted(warm, i, f);
+        return 0;
     }
-    for (int round = 0; count > 0; round++) {
-        size_t kept = 0;
-        for (size_t k = 0; k < count; k++)
-            disti_ray_point(&bench->rays[bench->index[k]], bench->rays[bench->index[k]].q, bench->points + 3 * k);
-        size_t asked = disti_query(warm->tracer, warm->worker, bench, count);
-        bench->stats->refine_queries += asked;
-        for (size_t k = 0; k < count; k++) {
-            disti_ray *ray = &bench->rays[bench->index[k]];
-            float f = k < asked ? bench->sdf[k] : 0.0f, epsilon = disti_ray_epsilon(warm->tracer, ray, ray->q);
-            int hit = ray->status == DIST_RAY_HIT;
-            float away = hit ? 0.5f * warm->change + 2.0f * epsilon : 0.03f * warm->tracer->field->radius;
-            if (!(f > away) || round > 16) near[close++] = bench->index[k];
-            else if (hit && f < ray->f && f < -0.7f * ray->slope * (ray->best - ray->q))
-                bench->index[kept++] = bench->index[k];
-            else /* the sphere around the last sample, and those before */
-                warm->tape->beside[disti_warm_pixel(warm, bench->index[k])] = 0.5f * DISTI_MIN(f, ray->f);
-            ray->f = f;
-            ray->s = ray->q;
-            ray->q += f / warm->tracer->lipschitz;
-        }
-        count = kept;
-    }
-    for (size_t k = 0; k < close; k++) bench->index[k] = near[k];
-    disti_warm_near(warm, close);
+    if (ask < DISTI_ASK_MARCH && !disti_finite(f)) return disti_warm_again(warm, i);
+    if (ask == DISTI_ASK_NEWTON) return disti_warm_newton(warm, i, f);
+    if (ask == DISTI_ASK_LEAST) return disti_warm_least(warm, i, f);
+    if (ask == DISTI_ASK_BESIDE) return disti_warm_sphere(warm, i, f);
+    if (ask == DISTI_ASK_NEAR) return disti_warm_near(warm, i, f);
+    disti_stats_slope(warm->tracer, ray, f, bench->stats);
+    if (disti_ray_advance(warm->tracer, ray, f)) return 1;
+    bench->depth[i] = disti_hit_depth(ray);
+    if (bench->budget) bench->budget->hits += (unsigned)disti_ray_is_hit(warm->tracer, ray);
+    return 0;
 }
 
-/* Ray i, which is done, marches, and is expected to end where it did. */
-static int disti_warm_expected(disti_warm *warm, int i)
+/* Asks all listed rays at once, whatever for, until none is awaited, or all are done. */
+static void disti_warm_rounds(disti_warm *warm, int all)
 {
-    const disti_ray *ray = &warm->bench->rays[i];
-    float s = ray->status == DIST_RAY_HIT ? ray->best : ray->leave;
-    disti_warm_again(warm, i);
-    warm->moved[i] = s;
-    return i;
+    const disti_bench *bench = warm->bench;
+    while (all ? warm->count > 0 : warm->awaited > 0) {
+        size_t count = warm->count;
+        for (size_t k = 0; k < count; k++) {
+            const disti_ray *ray = &bench->rays[bench->index[k]];
+            disti_ray_point(ray, ray->q, bench->points + 3 * k);
+        }
+        size_t asked = disti_query(warm->tracer, warm->worker, bench, count);
+        for (size_t k = 0; k < asked; k++) {
+            int ask = warm->ask[bench->index[k]], marches = bench->rays[bench->index[k]].mode < DISTI_BAND;
+            int least = ask == DISTI_ASK_DRIFT || (ask == DISTI_ASK_LEAST && warm->silhouette);
+            ++*(least                                ? &bench->stats->silhouette_queries
+                : ask >= DISTI_ASK_MARCH && marches ? &bench->stats->march_queries
+                                                    : &bench->stats->refine_queries);
+            float value = warm->tape->value[disti_warm_pixel(warm, bench->index[k])]; /* 0: not measured */
+            if (ask == DISTI_ASK_LEAST && value > bench->sdf[k]) disti_warm_change(warm, value - bench->sdf[k]);
+        }
+        warm->count = warm->awaited = 0;
+        for (size_t k = 0; k < count; k++) {
+            int i = bench->index[k];
+            if (k < asked ? !disti_warm_take(warm, i, bench->sdf[k]) : 1) {
+                if (k >= asked && warm->ask[i] != DISTI_ASK_DRIFT) disti_warm_again(warm, i);
+                continue;
+            }
+            bench->index[warm->count++] = i;
+            warm->awaited += warm->ask[i] <= DISTI_ASK_LEAST;
+        }
+    }
 }
 
-/* Marches the rays whose turn it is, then those around any that ends nearer than expected, and so on. */
-static void disti_warm_refresh(disti_warm *warm)
+/* Ray i marches, and is expected to end at s. */
+static void disti_warm_refresh(disti_warm *warm, int i, float s)
+{
+    disti_warm_again(warm, i);
+    disti_warm_list(warm, i, DISTI_ASK_REFRESH, warm->bench->rays[i].start);
+    if (s < 2e38f) warm->moved[i] = s;
+}
+
+/* Lists what is around each ray that was marched anew and ended nearer than expected. */
+static void disti_warm_doubt(disti_warm *warm)
 {
     const disti_bench *bench = warm->bench;
     float far = 0.01f * warm->tracer->field->radius + 4.0f * warm->change;
-    int width = warm->tile->width, *list = (int *)(void *)(warm->open + 2 * DISTI_TILE * DISTI_TILE);
-    size_t count = 0;
-    for (int i = 0; i < warm->n; i++) {
-        warm->moved[i] = 3e38f; /* from here on: where the ray was expected */
-        size_t pixel = disti_warm_pixel(warm, i);
-        int miss = (warm->tape->status[pixel] & 15) == DIST_RAY_MISS;
-        if (!warm->open[i] || !disti_warm_due(warm, i, miss ? DISTI_WARM_MISSES : DISTI_WARM_HITS)) continue;
-        if (!miss && !disti_warm_expects(warm, i, warm->tape->s[pixel])) continue;
-        list[count] = disti_warm_expected(warm, i);
-        if (!miss) warm->moved[i] = warm->tape->s[pixel];
-        count++;
-    }
-    while (count > 0) {
-        size_t all = count;
-        memcpy(bench->index, list, count * sizeof(int));
-        disti_trace_rounds(warm->tracer, warm->worker, bench, count, 0);
-        count = 0;
-        memcpy(bench->index, list, all * sizeof(int));
-        for (size_t k = 0; k < all; k++) {
-            int at = bench->index[k], x = at % width;
-            if (bench->rays[at].status != DIST_RAY_HIT || !(bench->rays[at].best < warm->moved[at] - far)) continue;
-            for (int dy = -width; dy <= width; dy += width) {
-                for (int dx = -1; dx <= 1; dx++) {
-                    int i = at + dy + dx;
-                    if (x + dx < 0 || x + dx >= width || i < 0 || i >= warm->n || !bench->rays[i].kept) continue;
-                    list[count++] = disti_warm_expected(warm, i);
-                }
-            }
+    int width = warm->tile->width;
+    for (int at = 0; at < warm->n; at++) {
+        const disti_ray *ray = &bench->rays[at];
+        if (warm->ask[at] != DISTI_ASK_REFRESH || ray->mode != DISTI_DONE) continue;
+        size_t pixel = disti_warm_pixel(warm, at);
+        int hit = (warm->tape->status[pixel] & 15) == DIST_RAY_HIT;
+        float expected = warm->moved[at] < 2e38f ? warm->moved[at] : hit ? warm->tape->s[pixel] : ray->leave;
+        warm->ask[at] = DISTI_ASK_KNOWN;
+        if (ray->status != DIST_RAY_HIT || !(ray->best < expected - far)) continue;
+        for (int k = 0; k < 9; k++) {
+            int x = at % width + k % 3 - 1, y = at / width + k / 3 - 1, i = y * width + x;
+            if (x < 0 || y < 0 || x >= width || y >= warm->tile->height || !bench->rays[i].kept) continue;
+            disti_warm_refresh(warm, i, bench->rays[i].status == DIST_RAY_HIT ? bench->rays[i].best : bench->rays[i].leave);
         }
     }
 }
@@ -11451,21 +11462,52 @@ static void disti_render_warm(const disti_render_job *job, int worker, const dis
     warm.n = tile->width * tile->height;
     warm.silhouette = job->least;
     warm.change = warm.mean = job->change;
+    warm.due = warm.silhouette && disti_warm_minima_due(&warm, warm.mean);
     warm.moved = (float *)(void *)bench->rest;
     warm.drift = warm.moved + warm.n;
     warm.open = bench->rest + (size_t)warm.n * 2 * sizeof(float);
+    warm.ask = warm.open + warm.n;
+    size_t before, left = 0;
     for (int i = 0; i < warm.n; i++) {
-        warm.moved[i] = 3e38f;
+        warm.moved[i] = warm.drift[i] = 3e38f;
         warm.open[i] = bench->rays[i].mode != DISTI_DONE;
+        warm.ask[i] = DISTI_ASK_NOTHING;
+        bench->depth[i] = 0.0f;
     }
-    int good = disti_warm_hits(&warm);
-    if (good) {
-        disti_warm_misses(&warm);
-        disti_warm_beside(&warm);
-        disti_warm_refresh(&warm);
+    for (int i = 0; i < warm.n; i++) { /* those whose turn it is march beside all that follows */
+        size_t pixel = disti_warm_pixel(&warm, i);
+        int miss = (warm.tape->status[pixel] & 15) == DIST_RAY_MISS;
+        if (!warm.open[i] || !disti_warm_due(&warm, i, miss ? DISTI_WARM_MISSES : DISTI_WARM_HITS)) continue;
+        if (miss || disti_warm_expects(&warm, i, warm.tape->s[pixel])) disti_warm_refresh(&warm, i, 3e38f);
     }
-    for (int i = 0; i < warm.n && !good; i++)
-        if (warm.open[i]) disti_warm_again(&warm, i);
+    before = warm.count;
+    disti_warm_hits(&warm, 0);
+    size_t tried = warm.count - before;
+    disti_warm_drifts(&warm, 8);
+    disti_warm_rounds(&warm, 0);
+    int good = disti_warm_good(&warm, tried);
+    for (int h = 4, pass = 1; h >= 1 && good; h /= 2, pass++) {
+        if (pass < 3) disti_warm_hits(&warm, pass);
+        disti_warm_drifts(&warm, h);
+        disti_warm_rounds(&warm, 0);
+    }
+    if (good) disti_warm_misses(&warm);
+    for (int i = 0; i < warm.n && good; i++) {
+        if (warm.ask[i] == DISTI_ASK_REFRESH || warm.ask[i] == DISTI_ASK_LEAST) continue;
+        if (disti_warm_beside(&warm, i, 1)) disti_warm_list(&warm, i, DISTI_ASK_BESIDE, bench->rays[i].q);
+        left += bench->rays[i].mode != DISTI_DONE;
+    }
+    warm.late = good && left * 32 < (size_t)warm.n;
+    for (int i = 0; i < warm.n; i++) {
+        int listed = warm.ask[i] >= DISTI_ASK_LEAST && warm.ask[i] != DISTI_ASK_MARCH;
+        if (good ? listed || bench->rays[i].mode == DISTI_DONE : !warm.open[i]) continue;
+        if (disti_warm_again(&warm, i)) disti_warm_list(&warm, i, DISTI_ASK_MARCH, bench->rays[i].q);
+    }
+    do {
+        if (good) disti_warm_rounds(&warm, 1);
+        warm.late = warm.count = 0;
+        if (good) disti_warm_doubt(&warm);
+    } while (warm.count > 0);
 }
 
 /* Misses that were traced have no sample where |f| is least,

@@ -9548,6 +9548,7 @@ typedef struct disti_cone {
     double chord, cosine, sine; /* of the cone's half angle: chord = 2 sin(angle / 2) */
     int x, y;     /* first pixel, within the tile */
     int size;
+    int tile;     /* which, where cones of several are asked for together */
     int state;    /* DISTI_CONE_* */
     int steps;
     float f;      /* last sample */
@@ -9689,6 +9690,7 @@ static void disti_cone_add(const disti_tracer *tracer, const disti_tile *tile, c
     cone->x = x;
     cone->y = y;
     cone->size = size;
+    cone->tile = parent ? parent->tile : 0;
     cone->t = parent ? parent->t : 0.0;
     cone->least_t = parent ? parent->least_t : 0.0;
     cone->least_f = parent ? parent->least_f : 3e38f;
@@ -9711,7 +9713,7 @@ static void disti_cone_split(const disti_tracer *tracer, const disti_tile *tile,
 }
 
 /* Marches the `active` cones listed in bench->index, and the parts that they fall into down to `leaf` pixels, all that
-   are on their way in packed rounds. */
+   are on their way in packed rounds. tile: that of cones whose `tile` is 0, and those that follow. */
 static void disti_cone_rounds(const disti_tracer *tracer, int worker, const disti_tile *tile, const disti_bench *bench,
                               int *count, size_t active, int leaf)
 {
@@ -9725,24 +9727,36 @@ static void disti_cone_rounds(const disti_tracer *tracer, int worker, const dist
             cone->state = i < asked ? disti_cone_advance(tracer, cone, bench->sdf[i]) : DISTI_CONE_BLOCKED;
             if (cone->state == DISTI_CONE_MARCHES) bench->index[kept++] = bench->index[i];
             if (cone->state == DISTI_CONE_BLOCKED && i < asked && cone->size > leaf)
-                disti_cone_split(tracer, tile, bench, cone, count, &all);
+                disti_cone_split(tracer, tile + cone->tile, bench, cone, count, &all);
         }
         memmove(bench->index + kept, bench->index + active, (all - active) * sizeof(int));
         active = kept + all - active;
     }
 }
 
-/* Blocks of 32, 16, 8 and so on to `leaf` pixels. Returns how many are not seen to be empty. */
-static int disti_cones(const disti_tracer *tracer, int worker, const disti_tile *tile, disti_bench *bench, int leaf)
+/* Adds the tile's largest blocks, 32 pixels. */
+static void disti_cones_first(const disti_tracer *tracer, const disti_tile *tile, disti_bench *bench, int leaf,
+                              size_t *listed)
 {
-    const disti_cone *cone = (disti_cone *)(void *)bench->rest;
-    size_t active = 0;
-    int blocked = 0, first = DISTI_CONE_FIRST;
-    DIST_ASSERT((size_t)DISTI_CONES_MOST * sizeof(disti_cone) <= (size_t)DISTI_REST_BYTES);
+    int first = DISTI_CONE_FIRST;
     while (first > leaf && first / 2 >= DISTI_MAX(tile->own_width, tile->own_height)) first /= 2;
     for (int y = 0; y < tile->own_height; y += first)
         for (int x = 0; x < tile->own_width; x += first)
-            disti_cone_add(tracer, tile, bench, x, y, first, NULL, &bench->cones, &active);
+            disti_cone_add(tracer, tile, bench, x, y, first, NULL, &bench->cones, listed);
+}
+
+/* Blocks of 32, 16, 8 and so on to `leaf` pixels. Returns how many are not seen to be empty. known: all of them, if they
+   have been asked for before, up to one of size 0. */
+static int disti_cones(const disti_tracer *tracer, int worker, const disti_tile *tile, disti_bench *bench, int leaf,
+                       const disti_cone *known)
+{
+    disti_cone *cones = (disti_cone *)(void *)bench->rest;
+    const disti_cone *cone = cones;
+    size_t active = 0;
+    int blocked = 0;
+    DIST_ASSERT((size_t)DISTI_CONES_MOST * sizeof(disti_cone) <= (size_t)DISTI_REST_BYTES);
+    if (!known) disti_cones_first(tracer, tile, bench, leaf, &active);
+    for (; known && known->size > 0; known++) cones[bench->cones++] = *known;
     disti_cone_rounds(tracer, worker, tile, bench, &bench->cones, active, leaf);
     for (int i = 0; i < bench->cones; i++) blocked += cone[i].state == DISTI_CONE_BLOCKED;
     if (tile->lazy && blocked == 0) return 0;
@@ -10434,6 +10448,7 @@ struct dist_tape {
     /* (pixels), warm start only: slope at a hit, |f| at a miss; where the cones stopped; disti_nearest_task's, and what
        f is not below from there on as far as disti_warm_beside looked */
     float *value, *start, *nearest, *beside;
+    disti_cone *cones;      /* warm start: all of the picture, asked for beside those of other tiles */
     unsigned turn;          /* warm renders so far */
     int rendered, has_silhouette;
     dist_field field;
@@ -10449,6 +10464,26 @@ struct dist_tape {
 /* counts as a hit; has a sample of smallest |f|; misses by less than how.relax_band */
 enum { DISTI_TAPE_HIT = 16, DISTI_TAPE_SAMPLE = 32, DISTI_TAPE_NEAR = 64 };
 
+/* The most cones that a tile of this size has, down to blocks of 8 pixels, and one of size 0; those of a picture,
+   whatever its tiles. */
+static int disti_tile_cones(int tile)
+{
+    int across = (tile + (int)DISTI_CONE_FIRST - 1) / (int)DISTI_CONE_FIRST;
+    return across * across * (1 + 4 + 16) + 1;
+}
+
+static size_t disti_picture_cones(int width, int height)
+{
+    const int tiles[3] = {(int)DISTI_TILE_USUAL / 2, (int)DISTI_TILE_USUAL, (int)DISTI_TILE};
+    size_t most = 0;
+    for (int i = 0; i < 3; i++) {
+        int t = tiles[i];
+        size_t count = (size_t)((width + t - 1) / t) * (size_t)((height + t - 1) / t) * (size_t)disti_tile_cones(t);
+        most = DISTI_MAX(most, count);
+    }
+    return most;
+}
+
 /* Returns the bytes needed; base NULL: only that. warm: also what the next picture starts from. */
 static size_t disti_tape_layout(dist_tape *tape, unsigned char *base, int warm)
 {
@@ -10459,6 +10494,10 @@ static size_t disti_tape_layout(dist_tape *tape, unsigned char *base, int warm)
         tape->sample = (float *)disti_take(base, &at, pixels, (size_t)tape->samples * 4 * sizeof(float));
     float **kept[4] = {&tape->value, &tape->start, &tape->nearest, &tape->beside};
     for (int i = 0; i < 4 && warm; i++) *kept[i] = (float *)disti_take(base, &at, pixels, sizeof(float));
+    if (warm) {
+        size_t cones = disti_picture_cones(tape->width, tape->height);
+        tape->cones = (disti_cone *)disti_take(base, &at, cones, sizeof(disti_cone));
+    }
     tape->entry = (disti_entry *)disti_take(base, &at, each, sizeof(disti_entry));
     tape->points = (float *)disti_take(base, &at, each, three);
     tape->d_sdf = (float *)disti_take(base, &at, each, sizeof(float));
@@ -10540,6 +10579,7 @@ typedef struct disti_render_job {
     int predict; /* pixels start from what their neighbors found */
     int least;   /* misses need their smallest f: for the silhouette or the relaxed boundary */
     int warm;    /* and from what the tape's picture found */
+    int coned;   /* the cones stand in the tape */
     int lazy;    /* nothing is wanted of rays that miss */
     int cheap;   /* and a query costs so little that it is asked sooner than a ray looks for balls */
     float step;  /* three pixels' width at the field's center */
@@ -11593,6 +11633,44 @@ static int disti_render_warms(const disti_tracer *tracer, const dist_camera *cam
            !tracer->how.certified;
 }
 
+static void disti_tile_init(const disti_render_job *job, int index, disti_tile *tile)
+{
+    memset(tile, 0, sizeof *tile);
+    tile->view = job->view;
+    tile->normals = job->out->normal && job->tracer->how.normal_mode == DIST_NORMAL_ANALYTIC;
+    tile->x = index % job->across * job->tile;
+    tile->y = index / job->across * job->tile;
+    tile->own_width = tile->width = DISTI_MIN(job->tile, job->view->width - tile->x);
+    tile->own_height = tile->height = DISTI_MIN(job->tile, job->view->height - tile->y);
+    tile->lazy = job->lazy;
+    tile->cheap = job->cheap;
+}
+
+/* A warm picture's cones: few a tile, so those of several tiles are asked for together. */
+enum { DISTI_CONE_TILES = 9 };
+
+static void disti_cones_task(void *arg, int index, int worker)
+{
+    const disti_render_job *job = (const disti_render_job *)arg;
+    disti_bench bench;
+    disti_tile tiles[DISTI_CONE_TILES];
+    size_t active = 0, each = (size_t)disti_tile_cones(job->tile);
+    int first = index * (int)DISTI_CONE_TILES, count = DISTI_MIN(job->count - first, (int)DISTI_CONE_TILES);
+    memset(tiles, 0, sizeof tiles);
+    disti_bench_init(job->tracer->ctx, worker, &bench);
+    disti_cone *cones = (disti_cone *)(void *)bench.rest, *to[DISTI_CONE_TILES];
+    for (int i = 0; i < count; i++) {
+        int before = bench.cones;
+        disti_tile_init(job, first + i, &tiles[i]);
+        disti_cones_first(job->tracer, &tiles[i], &bench, (int)DISTI_LATTICE, &active);
+        for (int k = before; k < bench.cones; k++) cones[k].tile = i;
+        to[i] = job->tape->cones + (size_t)(first + i) * each;
+    }
+    disti_cone_rounds(job->tracer, worker, tiles, &bench, &bench.cones, active, (int)DISTI_LATTICE);
+    for (int k = 0; k < bench.cones; k++) *to[cones[k].tile]++ = cones[k];
+    for (int i = 0; i < count; i++) to[i]->size = 0;
+}
+
 static void disti_render_task(void *arg, int index, int worker)
 {
     const disti_render_job *job = (const disti_render_job *)arg;
@@ -11600,13 +11678,7 @@ static void disti_render_task(void *arg, int index, int worker)
     disti_bench bench;
     disti_tile tile;
     disti_bench_init(tracer->ctx, worker, &bench);
-    tile.view = job->view;
-    tile.list = NULL;
-    tile.normals = job->out->normal && tracer->how.normal_mode == DIST_NORMAL_ANALYTIC;
-    tile.x = index % job->across * job->tile;
-    tile.y = index / job->across * job->tile;
-    tile.own_width = tile.width = DISTI_MIN(job->tile, job->view->width - tile.x);
-    tile.own_height = tile.height = DISTI_MIN(job->tile, job->view->height - tile.y);
+    disti_tile_init(job, index, &tile);
     disti_budget budget;
     disti_render_budget(job, &tile, &budget);
     if (tracer->how.max_queries > 0) bench.budget = &budget;
@@ -11615,8 +11687,6 @@ static void disti_render_task(void *arg, int index, int worker)
     if (predict && tile.y + tile.height < job->view->height) tile.height++;
     int n = tile.width * tile.height, open = 1;
     unsigned long long met = bench.stats->rays_in_sphere;
-    tile.lazy = job->lazy;
-    tile.cheap = job->cheap;
     if (!tile.lazy) disti_tile_rays(tracer, &tile, &bench, 0, 0, tile.width, tile.height);
 #ifndef DIST_NO_PAPER
     if (tracer->how.trace == DIST_TRACE_PAPER) {
@@ -11630,8 +11700,9 @@ static void disti_render_task(void *arg, int index, int worker)
         budget.left -= kept;
         for (int i = 0; i < DISTI_LEASTS; i++) bench.least_of->f[i] = 3e38f;
         if (!tracer->how.no_cones)
-            open = disti_cones(tracer, worker, &tile, &bench,
-                               job->predict ? (int)DISTI_LATTICE : (int)DISTI_CONE_LEAF);
+            open = disti_cones(tracer, worker, &tile, &bench, job->predict ? (int)DISTI_LATTICE : (int)DISTI_CONE_LEAF,
+                               job->coned ? job->tape->cones + (size_t)index * (size_t)disti_tile_cones(job->tile)
+                                          : NULL);
         if (tile.lazy && job->out->stats) disti_render_meets(job, &tile, bench.stats);
         met = bench.stats->rays_in_sphere;
         if (tile.lazy && !open) {
@@ -11816,6 +11887,8 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     job.change = job.warm ? disti_render_change(&tracer, &view, tape) : 0.0f;
     if (!(job.change <= 4e-3f * field->radius)) job.warm = 0;
     if (job.warm) disti_run(ctx, (view.height + DISTI_TILE - 1) / DISTI_TILE, disti_nearest_task, &job);
+    job.coned = job.warm && job.predict && !tracer.how.pixels && tracer.how.max_queries == 0;
+    if (job.coned) disti_run(ctx, (job.count + DISTI_CONE_TILES - 1) / DISTI_CONE_TILES, disti_cones_task, &job);
     disti_run(ctx, job.count, listed ? disti_render_list_task : disti_render_task, &job);
     disti_stats_end(ctx, &tracer, out->stats);
     if (!tape) return DIST_OK;

@@ -11368,7 +11368,7 @@ static int disti_warm_sphere(disti_warm *warm, int i, float f)
     float away = hit ? 0.5f * warm->change + 2.0f * epsilon : 0.03f * warm->tracer->field->radius;
     ray->f = f;
     ray->s = ray->q;
-    if (!(f > away) || ray->steps++ > 16) return disti_warm_approach(warm, i);
+    if (!(f > away) || ray->steps++ > 7) return disti_warm_approach(warm, i);
     more = hit && f < before && f < -0.7f * ray->slope * (ray->best - ray->q);
     if (!more) warm->tape->beside[disti_warm_pixel(warm, i)] = 0.5f * DISTI_MIN(f, before); /* this sphere, and those before */
     ray->q += f / warm->tracer->lipschitz;
@@ -11427,33 +11427,50 @@ static int disti_warm_take(disti_warm *warm, int i, float f)
     return 0;
 }
 
+/* Whether the next two samples of ray i, on both sides of the lowest one, are asked for at once. */
+static int disti_warm_both(const disti_warm *warm, int i)
+{
+    const disti_ray *ray = &warm->bench->rays[i];
+    return warm->ask[i] == DISTI_ASK_NEAR && ray->mode == DISTI_WAIT && ray->side == 0;
+}
+
 /* Asks all listed rays at once, whatever for, until none is awaited, or all are done. */
 static void disti_warm_rounds(disti_warm *warm, int all)
 {
     const disti_bench *bench = warm->bench;
     while (all ? warm->count > 0 : warm->awaited > 0) {
-        size_t count = warm->count;
+        size_t count = warm->count, points = 0, at = 0;
+        int pairs = 2 * count <= (size_t)DISTI_TILE_RAYS;
         for (size_t k = 0; k < count; k++) {
             const disti_ray *ray = &bench->rays[bench->index[k]];
-            disti_ray_point(ray, ray->q, bench->points + 3 * k);
+            disti_ray_point(ray, ray->q, bench->points + 3 * points++);
+            if (pairs && disti_warm_both(warm, bench->index[k]))
+                disti_ray_point(ray, DISTI_MIN(ray->s + ray->width, ray->leave), bench->points + 3 * points++);
         }
-        size_t asked = disti_query(warm->tracer, warm->worker, bench, count);
-        for (size_t k = 0; k < asked; k++) {
-            int ask = warm->ask[bench->index[k]], marches = bench->rays[bench->index[k]].mode < DISTI_BAND;
-            int least = ask == DISTI_ASK_DRIFT || (ask == DISTI_ASK_LEAST && warm->silhouette);
-            ++*(least                                ? &bench->stats->silhouette_queries
-                : ask >= DISTI_ASK_MARCH && marches ? &bench->stats->march_queries
-                                                    : &bench->stats->refine_queries);
-            float value = warm->tape->value[disti_warm_pixel(warm, bench->index[k])]; /* 0: not measured */
-            if (ask == DISTI_ASK_LEAST && value > bench->sdf[k]) disti_warm_change(warm, value - bench->sdf[k]);
-        }
-        warm->count = warm->awaited = 0;
+        size_t asked = disti_query(warm->tracer, warm->worker, bench, points);
         for (size_t k = 0; k < count; k++) {
-            int i = bench->index[k];
-            if (k < asked ? !disti_warm_take(warm, i, bench->sdf[k]) : 1) {
-                if (k >= asked && warm->ask[i] != DISTI_ASK_DRIFT) disti_warm_again(warm, i);
-                continue;
-            }
+            int i = bench->index[k], ask = warm->ask[i], both = pairs && disti_warm_both(warm, i);
+            int least = ask == DISTI_ASK_DRIFT || (ask == DISTI_ASK_LEAST && warm->silhouette);
+            int march = ask >= DISTI_ASK_MARCH && bench->rays[i].mode < DISTI_BAND;
+            size_t each = DISTI_MIN((size_t)(1 + both), asked - DISTI_MIN(at, asked));
+            *(least   ? &bench->stats->silhouette_queries
+              : march ? &bench->stats->march_queries
+                      : &bench->stats->refine_queries) += each;
+            float value = warm->tape->value[disti_warm_pixel(warm, i)]; /* 0: not measured */
+            if (ask == DISTI_ASK_LEAST && each > 0 && value > bench->sdf[at])
+                disti_warm_change(warm, value - bench->sdf[at]);
+            at += (size_t)(1 + both);
+        }
+        at = warm->count = warm->awaited = 0;
+        for (size_t k = 0; k < count; k++) {
+            int i = bench->index[k], both = pairs && disti_warm_both(warm, i), more = 0;
+            const float *f = bench->sdf + at;
+            at += (size_t)(1 + both);
+            if (at <= asked) more = disti_warm_take(warm, i, f[0]);
+            else if (warm->ask[i] != DISTI_ASK_DRIFT) disti_warm_again(warm, i);
+            if (more && both && warm->ask[i] == DISTI_ASK_NEAR && bench->rays[i].mode == DISTI_WAIT)
+                more = disti_warm_take(warm, i, f[1]);
+            if (!more) continue;
             bench->index[warm->count++] = i;
             warm->awaited += warm->ask[i] <= DISTI_ASK_LEAST;
         }

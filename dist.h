@@ -594,7 +594,7 @@ typedef struct dist_images {
 /* Keeps what the gradient needs: one distance and one status a pixel, and the paper's K samples where asked for. */
 typedef struct dist_tape dist_tape;
 /* For pictures of exactly this camera's size and of this desc's trace, paper_row and samples.
-   With desc->warm_start the tape also keeps what the next picture can start from (16 bytes a pixel more). A dist_render
+   With desc->warm_start the tape also keeps what the next picture can start from (19 bytes a pixel more). A dist_render
    with warm_start then verifies the last picture's hits and near misses, one query each or none, instead of marching.
    It is meant for an optimization that moves the surface by less than about a pixel a step. Whatever does not
    verify, and every tile in which much has moved, is traced anew; so is the whole picture after a change of camera, of
@@ -9745,8 +9745,8 @@ static void disti_cones_first(const disti_tracer *tracer, const disti_tile *tile
             disti_cone_add(tracer, tile, bench, x, y, first, NULL, &bench->cones, listed);
 }
 
-/* Blocks of 32, 16, 8 and so on to `leaf` pixels. Returns how many are not seen to be empty. known: all of them, if they
-   have been asked for before, up to one of size 0. */
+/* Blocks of 32, 16, 8 and so on to `leaf` pixels. Returns how many are not seen to be empty. known: all of them, if
+   they have been asked for before, up to one of size 0. */
 static int disti_cones(const disti_tracer *tracer, int worker, const disti_tile *tile, disti_bench *bench, int leaf,
                        const disti_cone *known)
 {
@@ -10527,7 +10527,7 @@ static dist_status disti_tape_take(dist_context *ctx, dist_tape *tape, const dis
     tape->samples = how.samples;
     dist_status status = disti_partial_reserve(ctx, 1024); /* for codes of fields that are not nets */
     if (status != DIST_OK) return status;
-    size_t pixels, all, each = 5 + (how.warm_start ? 16u : 0u) + (how.trace == DIST_TRACE_PAPER ? 128u : 0u);
+    size_t pixels, all, each = 5 + (how.warm_start ? 20u : 0u) + (how.trace == DIST_TRACE_PAPER ? 128u : 0u);
     int fits = disti_size_mul((size_t)tape->width, (size_t)tape->height, &pixels) && disti_size_mul(pixels, each, &all);
     tape->bytes = fits && all < (size_t)-1 / 2 ? disti_tape_layout(tape, NULL, how.warm_start) : (size_t)-1;
     tape->memory = disti_alloc(ctx, tape->bytes);
@@ -11370,7 +11370,7 @@ static int disti_warm_sphere(disti_warm *warm, int i, float f)
     ray->s = ray->q;
     if (!(f > away) || ray->steps++ > 7) return disti_warm_approach(warm, i);
     more = hit && f < before && f < -0.7f * ray->slope * (ray->best - ray->q);
-    if (!more) warm->tape->beside[disti_warm_pixel(warm, i)] = 0.5f * DISTI_MIN(f, before); /* this sphere, and those before */
+    if (!more) warm->tape->beside[disti_warm_pixel(warm, i)] = 0.5f * DISTI_MIN(f, before); /* of this one and before */
     ray->q += f / warm->tracer->lipschitz;
     return more;
 }
@@ -11440,7 +11440,7 @@ static void disti_warm_rounds(disti_warm *warm, int all)
     const disti_bench *bench = warm->bench;
     while (all ? warm->count > 0 : warm->awaited > 0) {
         size_t count = warm->count, points = 0, at = 0;
-        int pairs = 2 * count <= (size_t)DISTI_TILE_RAYS;
+        int pairs = 2 * count <= (size_t)DISTI_TILE_RAYS, each;
         for (size_t k = 0; k < count; k++) {
             const disti_ray *ray = &bench->rays[bench->index[k]];
             disti_ray_point(ray, ray->q, bench->points + 3 * points++);
@@ -11452,10 +11452,10 @@ static void disti_warm_rounds(disti_warm *warm, int all)
             int i = bench->index[k], ask = warm->ask[i], both = pairs && disti_warm_both(warm, i);
             int least = ask == DISTI_ASK_DRIFT || (ask == DISTI_ASK_LEAST && warm->silhouette);
             int march = ask >= DISTI_ASK_MARCH && bench->rays[i].mode < DISTI_BAND;
-            size_t each = DISTI_MIN((size_t)(1 + both), asked - DISTI_MIN(at, asked));
+            each = at >= asked ? 0 : 1 + (both && at + 1 < asked);
             *(least   ? &bench->stats->silhouette_queries
               : march ? &bench->stats->march_queries
-                      : &bench->stats->refine_queries) += each;
+                      : &bench->stats->refine_queries) += (unsigned)each;
             float value = warm->tape->value[disti_warm_pixel(warm, i)]; /* 0: not measured */
             if (ask == DISTI_ASK_LEAST && each > 0 && value > bench->sdf[at])
                 disti_warm_change(warm, value - bench->sdf[at]);
@@ -11502,7 +11502,8 @@ static void disti_warm_doubt(disti_warm *warm)
         for (int k = 0; k < 9; k++) {
             int x = at % width + k % 3 - 1, y = at / width + k / 3 - 1, i = y * width + x;
             if (x < 0 || y < 0 || x >= width || y >= warm->tile->height || !bench->rays[i].kept) continue;
-            disti_warm_refresh(warm, i, bench->rays[i].status == DIST_RAY_HIT ? bench->rays[i].best : bench->rays[i].leave);
+            const disti_ray *beside = &bench->rays[i];
+            disti_warm_refresh(warm, i, beside->status == DIST_RAY_HIT ? beside->best : beside->leave);
         }
     }
 }
@@ -11562,7 +11563,8 @@ static void disti_render_warm(const disti_render_job *job, int worker, const dis
     }
     do {
         if (good) disti_warm_rounds(&warm, 1);
-        warm.late = warm.count = 0;
+        warm.late = 0;
+        warm.count = 0;
         if (good) disti_warm_doubt(&warm);
     } while (warm.count > 0);
 }

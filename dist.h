@@ -594,7 +594,7 @@ typedef struct dist_images {
 /* Keeps what the gradient needs: one distance and one status a pixel, and the paper's K samples where asked for. */
 typedef struct dist_tape dist_tape;
 /* For pictures of exactly this camera's size and of this desc's trace, paper_row and samples.
-   With desc->warm_start the tape also keeps what the next picture can start from (19 bytes a pixel more). A dist_render
+   With desc->warm_start the tape also keeps what the next picture can start from (18 bytes a pixel more). A dist_render
    with warm_start then verifies the last picture's hits and near misses, one query each or none, instead of marching.
    It is meant for an optimization that moves the surface by less than about a pixel a step. Whatever does not
    verify, and every tile in which much has moved, is traced anew; so is the whole picture after a change of camera, of
@@ -9745,8 +9745,8 @@ static void disti_cones_first(const disti_tracer *tracer, const disti_tile *tile
             disti_cone_add(tracer, tile, bench, x, y, first, NULL, &bench->cones, listed);
 }
 
-/* Blocks of 32, 16, 8 and so on to `leaf` pixels. Returns how many are not seen to be empty. known: all of them, if
-   they have been asked for before, up to one of size 0. */
+/* Blocks of 32, 16, 8 and so on to `leaf` pixels. Returns how many are not seen to be empty. known: those that did
+   not fall apart, if they have been asked for before, up to one of size 0. */
 static int disti_cones(const disti_tracer *tracer, int worker, const disti_tile *tile, disti_bench *bench, int leaf,
                        const disti_cone *known)
 {
@@ -10464,12 +10464,12 @@ struct dist_tape {
 /* counts as a hit; has a sample of smallest |f|; misses by less than how.relax_band */
 enum { DISTI_TAPE_HIT = 16, DISTI_TAPE_SAMPLE = 32, DISTI_TAPE_NEAR = 64 };
 
-/* The most cones that a tile of this size has, down to blocks of 8 pixels, and one of size 0; those of a picture,
-   whatever its tiles. */
+/* The most cones that do not fall apart in a tile of this size, blocks of 8 pixels or larger, and one of size 0; those
+   of a picture, whatever its tiles. */
 static int disti_tile_cones(int tile)
 {
     int across = (tile + (int)DISTI_CONE_FIRST - 1) / (int)DISTI_CONE_FIRST;
-    return across * across * (1 + 4 + 16) + 1;
+    return across * across * 16 + 1;
 }
 
 static size_t disti_picture_cones(int width, int height)
@@ -11686,7 +11686,8 @@ static void disti_cones_task(void *arg, int index, int worker)
         to[i] = job->tape->cones + (size_t)(first + i) * each;
     }
     disti_cone_rounds(job->tracer, worker, tiles, &bench, &bench.cones, active, (int)DISTI_LATTICE);
-    for (int k = 0; k < bench.cones; k++) *to[cones[k].tile]++ = cones[k];
+    for (int k = 0; k < bench.cones; k++)
+        if (cones[k].state != DISTI_CONE_SPLIT) *to[cones[k].tile]++ = cones[k];
     for (int i = 0; i < count; i++) to[i]->size = 0;
 }
 

@@ -5216,7 +5216,9 @@ typedef struct disti_block {
     float *inverse;    /* (layers, B): and its 1 / sigma */
     float *fold_lanes; /* (fold_count, max_rows, 16): parts of the sums of fold_delta over points, of few blocks */
     double *fold_sum;  /* (fold_count, max_rows): the sums */
-    float *tail;       /* (8, B): sdf, slope and curvature of the output, seed; (3 B): gradient */
+    float *value, *value_slope, *value_curvature; /* (B): of an output channel */
+    float *seed;       /* (3, B): its gradient, or those of r, g, b */
+    float *pull;       /* (B, 3): what the seed gives the points */
     int alive_count[DISTI_MAX_LAYERS];
     int alive_units[DISTI_MAX_LAYERS]; /* of them, units: those before the encoded point's rows */
     int columns;
@@ -5249,7 +5251,11 @@ static size_t disti_block_layout(const dist_net *net, unsigned char *base, disti
     }
     b->fold_lanes = (float *)disti_take(base, &at, (size_t)net->fold_count * rows, 16 * sizeof(float));
     b->fold_sum = (double *)disti_take(base, &at, (size_t)net->fold_count * rows, sizeof(double));
-    b->tail = (float *)disti_take(base, &at, 11, row);
+    b->value = (float *)disti_take(base, &at, 1, row);
+    b->value_slope = (float *)disti_take(base, &at, 1, row);
+    b->value_curvature = (float *)disti_take(base, &at, 1, row);
+    b->seed = (float *)disti_take(base, &at, 3, row);
+    b->pull = (float *)disti_take(base, &at, 3, row);
     return at;
 }
 
@@ -5526,12 +5532,12 @@ static const float *disti_net_forward(const dist_shape *shape, disti_block *b, f
     return x;
 }
 
-/* Channel `channel` of the last layer, B lanes: value after the output function, its slope and, unless NULL, its
-   curvature. Tangents' lanes of value get the layer's tangent without the function's slope. */
-static void disti_net_output(const dist_shape *shape, const disti_block *b, const float *x, int channel, float *value,
-                             float *slope, float *curvature)
+/* Channel `channel` of the last layer to b->value after the output function, its slope and its curvature. Tangents'
+   lanes of the value get the layer's tangent without the function's slope. */
+static void disti_net_output(const dist_shape *shape, const disti_block *b, const float *x, int channel)
 {
     const dist_net *net = shape->net;
+    float *value = b->value;
     int l = net->layers - 1;
     const disti_linear *layer = &net->layer[l];
     int rows = layer->prev + layer->point;
@@ -5564,8 +5570,8 @@ static void disti_net_output(const dist_shape *shape, const disti_block *b, cons
         }
         if (finite) value[c] = v[c] - level;
         if (b->values) continue;
-        slope[c] = finite ? d[c] : 0.0f;
-        if (curvature) curvature[c] = finite ? bend[c] : 0.0f;
+        b->value_slope[c] = finite ? d[c] : 0.0f;
+        b->value_curvature[c] = finite ? bend[c] : 0.0f;
     }
 }
 
@@ -5824,18 +5830,16 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
     for (size_t at = 0; at < n; at += DISTI_BLOCK) {
         size_t count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK);
         disti_block_load(shape, &b, count, points + 3 * at);
-        float *value = b.tail, *slope = b.tail + DISTI_BLOCK, *seed = b.tail + 2 * DISTI_BLOCK,
-              *g = b.tail + 8 * DISTI_BLOCK;
         const float *x = disti_net_forward(shape, &b, NULL, disti_counter_of(shape->ctx, worker));
-        disti_net_output(shape, &b, x, net->sdf_channel, value, slope, NULL);
-        if (sdf) memcpy(sdf + at, value, count * sizeof(float));
-        if (!gradient && !seed_fn) continue;
-        disti_net_reverse(shape, &b, slope, NULL);
-        disti_encode_backward(net, &b, g);
-        if (gradient) memcpy(gradient + 3 * at, g, 3 * count * sizeof(float));
+        disti_net_output(shape, &b, x, net->sdf_channel);
+        if (sdf) memcpy(sdf + at, b.value, count * sizeof(float));
+        if (b.values) continue;
+        disti_net_reverse(shape, &b, b.value_slope, NULL);
+        disti_encode_backward(net, &b, b.pull);
+        if (gradient) memcpy(gradient + 3 * at, b.pull, 3 * count * sizeof(float));
         if (!seed_fn) continue;
-        seed_fn(seed_user, at, count, value, g, seed);
-        if (d_code) disti_fold_sum(shape, &b, seed, at / DISTI_BLOCK);
+        seed_fn(seed_user, at, count, b.value, b.pull, b.seed);
+        if (d_code) disti_fold_sum(shape, &b, b.seed, at / DISTI_BLOCK);
     }
     if (d_code) disti_fold_backward(shape, &b, 0, (size_t)net->code_size, d_code);
 }
@@ -5848,20 +5852,14 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
    backward  of s, with d = dL/d(pre-activation) and d' that of the tangent:  d = out''(a) a',  d' = out'(a);
              X = W_l^T d_l,  X' = W_l^T d'_l,  d_l-1 = phi'(a) X + phi''(a) a' X',  d'_l-1 = phi'(a) X'
              d_W_l = sum d x^T + d' x'^T,  d_b_l = sum d,  and the code's columns like the bias: its tangent is 0
-   Leaves d_b of the layers that see the code in b->fold_delta's lanes c, and returns ds/dp = H u (B / 2, 3). */
-static const float *disti_second_block(const dist_shape *shape, int worker, disti_block *b, size_t n,
-                                       const float *points, const float *directions, float *store)
+   Leaves d_b of the layers that see the code in b->fold_delta's lanes c, and ds/dp = H u (B / 2, 3) in b->pull. */
+static void disti_second_block(const dist_shape *shape, int worker, disti_block *b, size_t n, const float *points,
+                               const float *directions, float *store)
 {
     const dist_net *net = shape->net;
-    float *value, *slope, *curvature, *seed, *g;
     disti_block_begin(shape, worker, b, n, points);
     b->half = DISTI_BLOCK / 2;
     b->columns = DISTI_BLOCK; /* idle lanes repeat the last point with u = 0 and the seeds 0 */
-    value = b->tail;
-    slope = value + DISTI_BLOCK;
-    curvature = slope + DISTI_BLOCK;
-    seed = curvature + DISTI_BLOCK;
-    g = b->tail + 8 * DISTI_BLOCK;
     for (size_t c = 0; c < DISTI_BLOCK / 2; c++) {
         for (int axis = 0; axis < 3; axis++) {
             float u = c < n ? directions[3 * c + (size_t)axis] : 0.0f, factor = (float)net->base * u;
@@ -5877,15 +5875,14 @@ static const float *disti_second_block(const dist_shape *shape, int worker, dist
         }
     }
     const float *x = disti_net_forward(shape, b, store, disti_counter_of(shape->ctx, worker));
-    disti_net_output(shape, b, x, net->sdf_channel, value, slope, curvature);
-    memset(seed, 0, DISTI_BLOCK * sizeof(float));
+    disti_net_output(shape, b, x, net->sdf_channel);
+    memset(b->seed, 0, DISTI_BLOCK * sizeof(float));
     for (size_t c = 0; c < n; c++) {
-        seed[c] = curvature[c] * value[DISTI_BLOCK / 2 + c];
-        seed[DISTI_BLOCK / 2 + c] = slope[c];
+        b->seed[c] = b->value_curvature[c] * b->value[DISTI_BLOCK / 2 + c];
+        b->seed[DISTI_BLOCK / 2 + c] = b->value_slope[c];
     }
-    disti_net_reverse(shape, b, seed, store);
-    disti_encode_backward(net, b, g);
-    return g;
+    disti_net_reverse(shape, b, b->seed, store);
+    disti_encode_backward(net, b, b->pull);
 }
 
 /* dist_field.second_fn of a net. */
@@ -5899,8 +5896,8 @@ static void disti_shape_second(void *user, int worker, size_t n, const float *po
     if (d_code) disti_fold_begin(net, &b);
     for (size_t at = 0; at < n; at += DISTI_BLOCK / 2) {
         size_t count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK / 2);
-        const float *g = disti_second_block(shape, worker, &b, count, points + 3 * at, directions + 3 * at, NULL);
-        for (size_t i = 0; d_points && i < 3 * count; i++) d_points[3 * at + i] += g[i];
+        disti_second_block(shape, worker, &b, count, points + 3 * at, directions + 3 * at, NULL);
+        for (size_t i = 0; d_points && i < 3 * count; i++) d_points[3 * at + i] += b.pull[i];
         if (d_code) disti_fold_sum(shape, &b, NULL, at / DISTI_BLOCK);
     }
     if (d_code) disti_fold_backward(shape, &b, 0, (size_t)net->code_size, d_code);
@@ -5970,8 +5967,8 @@ static void disti_wide_eval(const dist_shape *shape, int worker, size_t n, const
             disti_copy_rows((size_t)last->prev, wide[net->layers & 1] + j * DISTI_BLOCK, stride, b.act[0], DISTI_BLOCK);
             disti_copy_rows((size_t)last->point, point + j * DISTI_BLOCK, stride,
                             b.act[0] + (size_t)last->prev * DISTI_BLOCK, DISTI_BLOCK);
-            disti_net_output(shape, &b, b.act[0], net->sdf_channel, b.tail, b.tail + DISTI_BLOCK, NULL);
-            memcpy(sdf + first, b.tail, DISTI_MIN(n - first, (size_t)DISTI_BLOCK) * sizeof(float));
+            disti_net_output(shape, &b, b.act[0], net->sdf_channel);
+            memcpy(sdf + first, b.value, DISTI_MIN(n - first, (size_t)DISTI_BLOCK) * sizeof(float));
         }
     }
     disti_counter_of(shape->ctx, worker)->done += (double)dist_net_operations(net, 1) * (double)n;
@@ -6298,9 +6295,8 @@ static int disti_group_eval(const dist_shape *shape, int worker, disti_group *g,
         b->columns = DISTI_MIN(n - j * DISTI_BLOCK, (int)DISTI_BLOCK);
         b->alive_count[last] = g->alive_count[j];
         memcpy(b->alive + (size_t)last * width, g->alive + (size_t)j * width, (size_t)g->alive_count[j] * sizeof(int));
-        disti_net_output(shape, b, g->x[last & 1] + (size_t)j * g->width * DISTI_BLOCK, net->sdf_channel, b->tail,
-                         b->tail + DISTI_BLOCK, NULL);
-        memcpy(sdf + j * DISTI_BLOCK, b->tail, (size_t)b->columns * sizeof(float));
+        disti_net_output(shape, b, g->x[last & 1] + (size_t)j * g->width * DISTI_BLOCK, net->sdf_channel);
+        memcpy(sdf + j * DISTI_BLOCK, b->value, (size_t)b->columns * sizeof(float));
         done += (double)g->alive_count[j] * (double)b->columns;
     }
     counter->done += done;
@@ -6411,8 +6407,8 @@ static void disti_shape_coarse(void *user, int worker, size_t n, const float *po
             b.columns = (int)DISTI_MIN(count - from, (size_t)DISTI_BLOCK);
             memcpy(b.delta[k] + (size_t)last->prev * DISTI_BLOCK, h.points[k],
                    (size_t)last->point * DISTI_BLOCK * sizeof(float));
-            disti_net_output(shape, &b, b.delta[k], net->sdf_channel, b.tail, b.tail + DISTI_BLOCK, NULL);
-            memcpy(sdf + at + from, b.tail, (size_t)b.columns * sizeof(float));
+            disti_net_output(shape, &b, b.delta[k], net->sdf_channel);
+            memcpy(sdf + at + from, b.value, (size_t)b.columns * sizeof(float));
         }
         if (h.bad) disti_shape_fused(user, worker, count, points + 3 * at, sdf + at, NULL, NULL, NULL, NULL);
     }
@@ -6430,8 +6426,8 @@ static void disti_shape_channels(const dist_shape *shape, int worker, size_t n, 
         b.values = 1;
         const float *x = disti_net_forward(shape, &b, NULL, disti_counter_of(shape->ctx, worker));
         for (int k = 0; k < count; k++) {
-            disti_net_output(shape, &b, x, first + k, b.tail, b.tail + DISTI_BLOCK, NULL);
-            for (size_t c = 0; c < columns; c++) channels[(at + c) * (size_t)count + (size_t)k] = b.tail[c];
+            disti_net_output(shape, &b, x, first + k);
+            for (size_t c = 0; c < columns; c++) channels[(at + c) * (size_t)count + (size_t)k] = b.value[c];
         }
     }
 }
@@ -6454,16 +6450,15 @@ static void disti_shape_color_fn(void *user, int worker, size_t n, const float *
 static void disti_color_reverse(const dist_shape *paint, int worker, disti_block *b, size_t n, const float *d_color,
                                 float *store)
 {
-    float *value = b->tail, *slope = b->tail + DISTI_BLOCK, *seed = b->tail + 2 * DISTI_BLOCK;
     const float *x = disti_net_forward(paint, b, store, disti_counter_of(paint->ctx, worker));
     b->channel = paint->net->color_channel;
     b->channels = 3;
     for (int k = 0; k < 3; k++) {
-        disti_net_output(paint, b, x, b->channel + k, value, slope, NULL);
+        disti_net_output(paint, b, x, b->channel + k);
         for (size_t c = 0; c < DISTI_BLOCK; c++)
-            seed[k * DISTI_BLOCK + (int)c] = c < n ? d_color[3 * c + (size_t)k] * slope[c] : 0.0f;
+            b->seed[k * DISTI_BLOCK + (int)c] = c < n ? d_color[3 * c + (size_t)k] * b->value_slope[c] : 0.0f;
     }
-    disti_net_reverse(paint, b, seed, store);
+    disti_net_reverse(paint, b, b->seed, store);
 }
 
 /* dist_field.color_adjoint_fn of a net. A texture's code is the shape's, then the color's: so are their columns. */
@@ -6480,11 +6475,9 @@ static void disti_shape_color_adjoint_fn(void *user, int worker, size_t n, const
         size_t count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK);
         disti_block_begin(paint, worker, &b, count, points + 3 * at);
         disti_color_reverse(paint, worker, &b, count, d_color + 3 * at, NULL);
-        float *ones = b.tail, *g = b.tail + 8 * DISTI_BLOCK;
-        if (d_points) disti_encode_backward(net, &b, g);
-        for (size_t i = 0; d_points && i < 3 * count; i++) d_points[3 * at + i] += g[i];
-        for (size_t c = 0; c < DISTI_BLOCK; c++) ones[c] = 1.0f;
-        if (d_code || d_color_code) disti_fold_sum(paint, &b, ones, at / DISTI_BLOCK);
+        if (d_points) disti_encode_backward(net, &b, b.pull);
+        for (size_t i = 0; d_points && i < 3 * count; i++) d_points[3 * at + i] += b.pull[i];
+        if (d_code || d_color_code) disti_fold_sum(paint, &b, NULL, at / DISTI_BLOCK);
     }
     if (d_code) disti_fold_backward(paint, &b, 0, own, d_code);
     if (d_color_code) disti_fold_backward(paint, &b, own, (size_t)net->code_size - own, d_color_code);
@@ -6564,29 +6557,26 @@ static void disti_weights_block(void *arg, int index, int worker)
     size_t at = job->first + (size_t)index * job->block;
     size_t count = DISTI_MIN(job->n - at, job->block);
     float *store = shape->ctx->store + (size_t)index * shape->store_block_size;
-    const float *pull;
     if (job->directions) {
-        pull = disti_second_block(shape, worker, &b, count, job->points + 3 * at, job->directions + 3 * at, store);
+        disti_second_block(shape, worker, &b, count, job->points + 3 * at, job->directions + 3 * at, store);
     } else {
         disti_block_begin(shape, worker, &b, count, job->points + 3 * at);
-        float *value = b.tail, *slope = b.tail + DISTI_BLOCK, *seed = b.tail + 2 * DISTI_BLOCK,
-              *g = b.tail + 8 * DISTI_BLOCK;
         if (job->d_color) {
             disti_color_reverse(shape, worker, &b, count, job->d_color + 3 * at, store);
         } else {
             const float *x = disti_net_forward(shape, &b, store, disti_counter_of(shape->ctx, worker));
-            disti_net_output(shape, &b, x, net->sdf_channel, value, slope, NULL);
-            if (job->seed_fn) job->seed_fn(job->seed_user, at, count, value, NULL, seed);
+            float *seed = b.seed;
+            disti_net_output(shape, &b, x, net->sdf_channel);
+            if (job->seed_fn) job->seed_fn(job->seed_user, at, count, b.value, NULL, seed);
             else memcpy(seed, job->d_sdf + at, count * sizeof(float));
             if (job->seed_fn && job->d_sdf) memcpy(job->d_sdf + at, seed, count * sizeof(float));
-            for (size_t c = 0; c < DISTI_BLOCK; c++) seed[c] = c < count ? seed[c] * slope[c] : 0.0f;
+            for (size_t c = 0; c < DISTI_BLOCK; c++) seed[c] = c < count ? seed[c] * b.value_slope[c] : 0.0f;
             disti_net_reverse(shape, &b, seed, store);
         }
-        disti_encode_backward(net, &b, g);
-        pull = g;
+        disti_encode_backward(net, &b, b.pull);
     }
     disti_weights_drop(net, job->directions ? (size_t)DISTI_BLOCK : count, store);
-    for (size_t i = 0; job->d_points && i < 3 * count; i++) job->d_points[3 * at + i] += pull[i];
+    for (size_t i = 0; job->d_points && i < 3 * count; i++) job->d_points[3 * at + i] += b.pull[i];
     if (!job->d_code) return;
     disti_fold_begin(net, &b);
     disti_fold_sum(shape, &b, NULL, 0);

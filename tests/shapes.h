@@ -248,4 +248,39 @@ TEST_UNUSED static dist_camera shape_camera(int width, int height)
     return dist_camera_look_at(width, height, (float)(50.0 * 3.14159265358979323846 / 180), eye, at, up);
 }
 
+/* One pixel that looks along +z from 0. */
+TEST_UNUSED static dist_camera shape_pinhole(void)
+{
+    dist_camera camera;
+    memset(&camera, 0, sizeof camera);
+    camera.fx = camera.fy = 1;
+    camera.rotation[0] = camera.rotation[4] = camera.rotation[8] = 1;
+    camera.width = camera.height = 1;
+    return camera;
+}
+
+/* A picture of at most SHAPE_PIXELS pixels, and what asks for all its planes but the color. */
+enum { SHAPE_PIXELS = 128 * 128 };
+typedef struct shape_picture {
+    float depth[SHAPE_PIXELS], distance[SHAPE_PIXELS], error[SHAPE_PIXELS], silhouette[SHAPE_PIXELS];
+    float normal[3 * SHAPE_PIXELS], color[3 * SHAPE_PIXELS];
+    unsigned char mask[SHAPE_PIXELS], status[SHAPE_PIXELS];
+    dist_stats stats;
+} shape_picture;
+
+TEST_UNUSED static dist_images shape_planes(shape_picture *p)
+{
+    dist_images out;
+    memset(&out, 0, sizeof out);
+    out.depth = p->depth;
+    out.distance = p->distance;
+    out.error = p->error;
+    out.silhouette = p->silhouette;
+    out.normal = p->normal;
+    out.mask = p->mask;
+    out.status = p->status;
+    out.stats = &p->stats;
+    return out;
+}
+
 #endif

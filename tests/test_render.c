@@ -3,31 +3,16 @@
    nothing. Numbers in comments are rows of the table of hard cases. */
 #include "shapes.h"
 
-enum { SIDE = 96, PIXELS = 8192 * 2 };
+enum { SIDE = 96, PIXELS = SHAPE_PIXELS };
 
-/* Every plane, and what they were filled with before. */
-typedef struct planes {
-    float depth[PIXELS], distance[PIXELS], normal[3 * PIXELS], silhouette[PIXELS], color[3 * PIXELS], error[PIXELS];
-    unsigned char mask[PIXELS], status[PIXELS];
-    dist_stats stats;
-} planes;
+typedef shape_picture planes;
 
 static planes a, b;
 
 static dist_images all_planes(planes *p)
 {
-    dist_images out;
     memset(p, 0x5a, sizeof *p);
-    memset(&out, 0, sizeof out);
-    out.depth = p->depth;
-    out.distance = p->distance;
-    out.normal = p->normal;
-    out.silhouette = p->silhouette;
-    out.mask = p->mask;
-    out.status = p->status;
-    out.error = p->error;
-    out.stats = &p->stats;
-    return out;
+    return shape_planes(p);
 }
 
 static dist_render_desc plain_how(void)

@@ -4,6 +4,7 @@
 #include "test.h"
 
 #include "model.h"
+#include "shapes.h"
 
 enum { PARTS = 24, NUMBERS = 24 };
 
@@ -426,28 +427,10 @@ TEST(gradients_for_points_codes_and_placements_are_those_of_double)
 
 enum { SIDE = 96, PIXELS = SIDE * SIDE };
 
-typedef struct picture {
-    float depth[PIXELS], error[PIXELS], silhouette[PIXELS], normal[3 * PIXELS];
-    unsigned char mask[PIXELS], status[PIXELS];
-    dist_stats stats;
-} picture;
+typedef shape_picture picture;
 
 static picture first, second;
 static float first_error[PIXELS], first_distance[PIXELS];
-
-static dist_images planes_of(picture *p)
-{
-    dist_images out;
-    memset(&out, 0, sizeof out);
-    out.depth = p->depth;
-    out.error = p->error;
-    out.silhouette = p->silhouette;
-    out.normal = p->normal;
-    out.mask = p->mask;
-    out.status = p->status;
-    out.stats = &p->stats;
-    return out;
-}
 
 static dist_camera camera_for(const dist_field *field, int side)
 {
@@ -519,7 +502,7 @@ TEST(a_scene_looks_like_the_union_that_asks_everything)
         all.fused_fn = NULL;
         all.code_size = 0;
         dist_camera camera = camera_for(&all, SIDE);
-        dist_images out = planes_of(&first), plain = planes_of(&second);
+        dist_images out = shape_planes(&first), plain = shape_planes(&second);
         CHECK_STATUS(DIST_OK, dist_render(ctx, &x.w.field, &camera, NULL, &out, NULL), ctx);
         CHECK_STATUS(DIST_OK, dist_render(ctx, &all, &camera, NULL, &plain, NULL), ctx);
         int differ = compare(&first, &second), hits = hits_of(&first);
@@ -556,7 +539,7 @@ TEST(a_scene_of_one_unmoved_instance_looks_like_its_field)
         CHECK_NEAR(a->field.radius, field.radius, 0);
         CHECK_NEAR_ARRAY(3, a->field.center, field.center, 0);
         dist_camera camera = camera_for(&field, SIDE);
-        dist_images out = planes_of(&first), plain = planes_of(&second);
+        dist_images out = shape_planes(&first), plain = shape_planes(&second);
         CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, NULL), ctx);
         CHECK_STATUS(DIST_OK, dist_render(ctx, &a->field, &camera, NULL, &plain, NULL), ctx);
         int differ = compare(&first, &second);
@@ -598,7 +581,7 @@ TEST(a_small_instance_is_as_sharp_as_alone)
     CHECK_NEAR(0.01 * (double)fields[1].radius, field.detail, 1e-8);
     double bounds[3] = {0, 0, 0};
     for (int mode = 0; mode < 3; mode++) { /* the last: as if the defaults went by the scene's radius */
-        dist_images out = planes_of(&first);
+        dist_images out = shape_planes(&first);
         dist_render_desc how;
         int judged = 0, dull = 0, wrong = 0;
         double worst = 0;
@@ -730,7 +713,7 @@ TEST(twenty_instances_cost_a_query_no_more_than_one_and_a_fifth)
         mixture_open(&x, 0, ctx);
         shelf_open(&w, &x, ctx, touching ? 0.0f : 0.3f);
         dist_camera camera = camera_for(&w.field, SIDE);
-        dist_images out = planes_of(&first);
+        dist_images out = shape_planes(&first);
         unsigned long long before = dist_scene_queries(w.scene);
         CHECK_STATUS(DIST_OK, dist_render(ctx, &w.field, &camera, NULL, &out, NULL), ctx);
         double asked = (double)(dist_scene_queries(w.scene) - before), per = asked / (double)first.stats.queries;

@@ -26,28 +26,14 @@ static void say(int good, const char *what, const char *expected, double got)
 }
 #define SAY(good, what, expected, got) say((good) ? 1 : 0, what, expected, (double)(got))
 
-typedef struct picture {
-    float depth[PIXELS], distance[PIXELS], error[PIXELS], silhouette[PIXELS], normal[3 * PIXELS];
-    unsigned char mask[PIXELS], status[PIXELS];
-    dist_stats stats;
-} picture;
+typedef shape_picture picture;
 
 static picture a, b;
 
 static dist_images images(picture *p)
 {
-    dist_images out;
     memset(p, 0, sizeof *p);
-    memset(&out, 0, sizeof out);
-    out.depth = p->depth;
-    out.distance = p->distance;
-    out.error = p->error;
-    out.silhouette = p->silhouette;
-    out.normal = p->normal;
-    out.mask = p->mask;
-    out.status = p->status;
-    out.stats = &p->stats;
-    return out;
+    return shape_planes(p);
 }
 
 static dist_status draw(dist_context *ctx, test_shape *shape, double radius, double lipschitz,
@@ -183,21 +169,11 @@ static dist_status pull_on(dist_context *ctx, const dist_field *field, const dis
 /* ---- 1 to 10: single rays ---------------------------------------------------------------------------------------- */
 
 /* A plane met at an angle, far enough away that neither the sphere nor the clamp matters. */
-static dist_camera pinhole(void)
-{
-    dist_camera camera;
-    memset(&camera, 0, sizeof camera);
-    camera.fx = camera.fy = 1;
-    camera.rotation[0] = camera.rotation[4] = camera.rotation[8] = 1;
-    camera.width = camera.height = 1;
-    return camera;
-}
-
 TEST(row_01_grazing_rays)
 {
     dist_context *ctx = shape_context();
     const double degrees[8] = {90, 45, 20, 10, 5, 1, 0.5, 0.1};
-    dist_camera camera = pinhole();
+    dist_camera camera = shape_pinhole();
     for (int k = 0; k < 8; k++) {
         for (int trace = 0; trace < 2; trace++) {
             double angle = degrees[k] * pi / 180;
@@ -257,7 +233,7 @@ TEST(row_02_steep_slopes)
             most = shape.queries - at - 1 > most ? shape.queries - at - 1 : most;
             CHECK_EQUAL(DIST_RAY_HIT, hit.status);
         }
-        dist_camera camera = pinhole();
+        dist_camera camera = shape_pinhole();
         test_shape plane = shape_make(SHAPE_PLANE, 0, 0, -1, -0.7213);
         dist_render_desc how = defaults(DIST_TRACE_PAPER);
         plane.slope = slopes[k];

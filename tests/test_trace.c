@@ -1008,22 +1008,11 @@ TEST(each_row_of_the_ladder_asks_less_than_the_one_before)
     dist_context_destroy(ctx);
 }
 
-/* One pixel that looks along +z from 0. */
-static dist_camera pinhole(void)
-{
-    dist_camera camera;
-    memset(&camera, 0, sizeof camera);
-    camera.fx = camera.fy = 1;
-    camera.rotation[0] = camera.rotation[4] = camera.rotation[8] = 1;
-    camera.width = camera.height = 1;
-    return camera;
-}
-
 /* 2: contracts while alpha * slope < 2. */
 TEST(the_paper_converges_up_to_slope_1_2_and_not_from_1_34_on)
 {
     dist_context *ctx = shape_context();
-    dist_camera camera = pinhole();
+    dist_camera camera = shape_pinhole();
     const double slopes[8] = {0.3, 0.6, 1, 1.2, 1.34, 1.5, 2, 5};
     for (int k = 0; k < 8; k++) {
         test_shape plane = shape_make(SHAPE_PLANE, 0, 0, -1, -0.7213);

@@ -8,8 +8,8 @@
 #   make matrix-quick   the part of it that every change must pass
 #   make bench          the benchmarks in short, under ten minutes; CSV and plots also go to bench/results;
 #                       build/bench_NAME --help tells what else they do
-#   make results        the paper's tables and figures with ours beside them, into bench/results/: about an hour on two
-#                       cores that have nothing else to do
+#   make results        the paper's tables and figures with ours beside them, into bench/results/: one to two hours on
+#                       two cores that have nothing else to do
 #   make results-quick  the same in small, into build/results/: a minute or two
 #   make clean
 

@@ -27,8 +27,9 @@
    knows nothing of its rounding. Where the processor has none of it the row says "not available".
 
    --minutes bounds what a case's size takes beside its reference: the rows come in order of importance, defaults first.
-   One is made with fewer runs (column `runs`) if 7 would take more than an eighth of the time, and is left out, with a
-   word on stderr, where one would, or where no time is left.
+   One is made with fewer runs (column `runs`) if 7 would take more than an eighth of the time (at a size without
+   sweeps: a third), and is left out, with a word on stderr, where one would, or where no time is left; but not the
+   defaults of guarded, certified and the paper's two fastest rows.
 
    --svg draws each case and size. Lines join the epsilons of one method, or its alphas or budgets of steps; the larger
    markers are the defaults. A marker is open where the picture failed: more than 1 in 1000 pixels that should be hit is
@@ -45,6 +46,8 @@ static const char usage[] =
     "bench_work_precision [options]\n"
     "  --case NAME        only this one\n"
     "  --size N           only pictures of N x N (default 64, 128, 256 and 512)\n"
+    "  --largest N        pictures of 64 x 64 up to N x N (default 512)\n"
+    "  --sweep N          sweeps at N x N alone; the other sizes get the defaults, and a third of --minutes\n"
     "  --long             also 1024, and the slow decoders: 8 x 512 and with layer norm; --minutes 4\n"
     "  --minutes M        for each case and size, beside its reference (default: no bound)\n"
     "  --svg STEM         also plots, STEM_CASE_N.svg\n"
@@ -727,11 +730,12 @@ static double render_once(const subject *j, const dist_render_desc *how, const d
     return seconds;
 }
 
-enum { RUNS = 7, OTHERS = 4 }; /* of one row: timed, and how many the rest takes about as long as */
+/* Of one row: timed, and how many the rest takes about as long as. Defaults of the first methods are never left out. */
+enum { RUNS = 7, OTHERS = 4, NEVER_LEFT_OUT = 4 };
 
 /* Renders `runs` times, fewer where all would take longer than `limit` seconds, then once more with the silhouette,
    once with all planes to judge, and once with a gradient. */
-static row picture(const subject *j, const dist_render_desc *how, int dense, int runs, double limit)
+static row picture(const subject *j, const dist_render_desc *how, int dense, int least, int runs, double limit)
 {
     row r;
     dist_stats stats;
@@ -749,7 +753,7 @@ static row picture(const subject *j, const dist_render_desc *how, int dense, int
     if (dense && j->shape) { j->shape->all_alive = ~(uint32_t)0; }
     for (int i = 0; i < runs; i++) {
         seconds[i] = render_once(j, how, &out, tape);
-        if (i == 0 && (runs + OTHERS) * seconds[0] > limit) { runs = (int)fmax(0, limit / seconds[0] - OTHERS); }
+        if (i == 0 && (runs + OTHERS) * seconds[0] > limit) { runs = (int)fmax(least, limit / seconds[0] - OTHERS); }
     }
     r.runs = runs;
     if (runs == 0) { /* too slow */
@@ -954,8 +958,8 @@ typedef struct sweep {
     dist_camera camera;
     reference ref;
     half halves[2]; /* F16, BF16 */
-    int quick;
-    double most, end;        /* seconds for a case's size, 0: no bound; and when they are over */
+    int quick, sweep_size;   /* the size at which parameters are swept; 0: each */
+    double most, end, share; /* seconds for a case's size, 0: no bound; when they are over; a row's part of them */
     double seconds[METHODS]; /* of a default picture, here or, times four, of half the size; 0: not known */
     const char *svg;         /* stem of the plots' names; NULL: none */
     row *rows;
@@ -1003,7 +1007,7 @@ static void add_row(sweep *w, const method *m, const char *parameter, double val
 {
     subject j = w->subject;
     double *expected = &w->seconds[m - methods];
-    double limit = w->most > 0 ? fmin(w->most / 8, w->end - seconds_now()) : 1e30;
+    double limit = w->most > 0 ? fmin(w->most / w->share, w->end - seconds_now()) : 1e30;
     if (m->half) {
         half *h = &w->halves[m->half == DIST_HALF_BF16];
         j.field = &h->field;
@@ -1013,7 +1017,10 @@ static void add_row(sweep *w, const method *m, const char *parameter, double val
     dist_render_desc how = how_of(m, parameter, value);
     row r;
     memset(&r, 0, sizeof r);
-    if (*expected * (1 + OTHERS) <= limit) { r = picture(&j, &how, m->dense, w->quick ? 3 : RUNS, limit); }
+    int least = strcmp(parameter, "default") == 0 && m - methods < NEVER_LEFT_OUT;
+    if (least || *expected * (1 + OTHERS) <= limit) {
+        r = picture(&j, &how, m->dense, least, w->quick ? 3 : RUNS, limit);
+    }
     if (!r.runs) {
         fprintf(stderr, "left out: %s %d %s %s %g\n", j.s->name, w->camera.width, m->name, parameter, value);
         return;
@@ -1051,6 +1058,10 @@ static void sweep_field(sweep *w, int size)
 {
     static const double none[1] = {0};
     size_t first = w->count;
+    double most = w->most;
+    int defaults = w->sweep_size && w->sweep_size != size;
+    if (defaults) { w->most = most / 3; }
+    w->share = defaults ? 3 : 8;
     subject *j = &w->subject;
     w->camera = camera_of(j->s, j->field, size);
     w->ref = reference_create(j->ctx, j->s, j->field, j->e, &w->camera);
@@ -1061,9 +1072,12 @@ static void sweep_field(sweep *w, int size)
     exact_gradient(j);
     w->end = seconds_now() + w->most;
     sweep_values(w, "default", 1, none);
-    sweep_values(w, "epsilon", sizeof epsilons / sizeof epsilons[0], epsilons);
-    sweep_values(w, "alpha", sizeof alphas / sizeof alphas[0], alphas);
-    sweep_values(w, "steps", sizeof budgets / sizeof budgets[0], budgets);
+    if (!defaults) {
+        sweep_values(w, "epsilon", sizeof epsilons / sizeof epsilons[0], epsilons);
+        sweep_values(w, "alpha", sizeof alphas / sizeof alphas[0], alphas);
+        sweep_values(w, "steps", sizeof budgets / sizeof budgets[0], budgets);
+    }
+    w->most = most;
     for (size_t k = 0; k < METHODS; k++) { w->seconds[k] *= 4; }
     reference_destroy(&w->ref);
     free(j->exact);
@@ -1217,6 +1231,7 @@ int main(int argc, char **argv)
     const char *only = NULL;
     int only_size = 0;
     int slow = 0;
+    int largest = 0;
     dist_context_desc settings = {.workers = 1};
     sweep w;
     memset(&w, 0, sizeof w);
@@ -1226,6 +1241,10 @@ int main(int argc, char **argv)
             only = option_text(&o);
         } else if (option_is(&o, "--size")) {
             only_size = option_int(&o, 8, 4096);
+        } else if (option_is(&o, "--largest")) {
+            largest = option_int(&o, 64, 4096);
+        } else if (option_is(&o, "--sweep")) {
+            w.sweep_size = option_int(&o, 8, 4096);
         } else if (option_is(&o, "--long")) {
             slow = option_flag(&o);
         } else if (option_is(&o, "--minutes")) {
@@ -1252,7 +1271,7 @@ int main(int argc, char **argv)
     for (int i = 0; i < SCENES; i++) {
         const scene *s = &scenes[i];
         int wanted = only ? strcmp(only, s->name) == 0 : w.quick ? s->quick : slow || !s->slow;
-        if (wanted) { run_scene(&w, s, only_size, w.quick ? 64 : slow ? 1024 : 512); }
+        if (wanted) { run_scene(&w, s, only_size, largest ? largest : w.quick ? 64 : slow ? 1024 : 512); }
     }
     print_worst(w.rows, w.count);
     if (w.svg) { plot_losses(w.svg, w.rows, w.count); }

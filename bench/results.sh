@@ -83,15 +83,18 @@ if [ -n "$python" ]; then
     } | section pytorch "The same step in PyTorch" "python3 bench/pytorch.py"
 fi
 
-# Every scene at one size here; build/bench_work_precision --long does all of them. Plots of some: each is 0.2 MB.
+# Sweeps at one size, defaults at all; build/bench_work_precision --long sweeps at each. Plots of some: each is 0.2 MB.
 mkdir -p build/work_precision || exit 1
 if [ -n "$quick" ]; then
-    csv work_precision build/bench_work_precision --quick --case embedded_5 --svg build/work_precision/q
+    csv work_precision build/bench_work_precision --quick --case embedded_5 --largest 128 --sweep 64 \
+        --svg build/work_precision/q
+    table_size=64
     cp build/work_precision/q_losses.svg "$folder/work_precision_losses.svg" || exit 1
     shown="embedded_5_64"
 else
     rm -f build/work_precision/*.svg
-    csv work_precision build/bench_work_precision --size 128 --minutes 1 --svg build/work_precision/q
+    csv work_precision build/bench_work_precision --largest 1024 --sweep 128 --minutes 1 --svg build/work_precision/q
+    table_size=128
     cp build/work_precision/q_losses.svg "$folder/work_precision_losses.svg" || exit 1
     shown="torus_grazing_128 rods_1e-3_128 embedded_5_128 mug_128"
 fi
@@ -100,13 +103,13 @@ for name in $shown; do
     [ ! -e "$plot" ] || cp "$plot" "$folder/work_precision_$name.svg"
 done
 {
-    echo "Defaults only: the error of the distance, against a reference in double, that 99 % of the hits keep (wrong pixels"
-    echo "of the mask; queries a pixel). The sweeps of epsilon, alpha, budget and K, every other measure and the times are"
-    echo "in the csv. n/a: this processor has no such arithmetic, or the field is no network; empty: left out for its time."
-    echo "[work_precision.txt](work_precision.txt): where bounds are violated, where a row of the paper's tracer is cheaper"
-    echo "or more exact, what was left out."
+    echo "Defaults only, $table_size x $table_size pixels: the error of the distance, against a reference in double, that"
+    echo "99 % of the hits keep (wrong pixels of the mask; queries a pixel). The sweeps of epsilon, alpha, budget and K, every"
+    echo "other measure and the times are in the csv. n/a: this processor has no such arithmetic, or the field is no network;"
+    echo "empty: left out for its time. [work_precision.txt](work_precision.txt): where bounds are violated, where a row of"
+    echo "the paper's tracer is cheaper or more exact, what was left out."
     echo
-    awk -F , -v methods="paper_parallel_100 paper_aggressive_50 paper_coarse_to_fine_50 guarded certified guarded_f16 \
+    awk -F , -v size="$table_size" -v methods="paper_parallel_100 paper_aggressive_50 paper_coarse_to_fine_50 guarded certified guarded_f16 \
 guarded_bf16" '
         function cell(m) {
             return " " ((s, m) in text ? text[s, m] : (s, m) in none || (m ~ /16$/ && !net[s]) ? "n/a" : "") " |"
@@ -116,12 +119,28 @@ guarded_bf16" '
         !($1 in place) { place[$1] = ++scenes; scene[scenes] = $1 }
         $8 > 0 { net[$1] = 1 }
         $3 == "not available" { none[$1, $2] = 1 }
-        $3 == "default" { text[$1, $2] = sprintf("%.0e (%d; %.2g)", $11, $13 + $14, $7) }
+        $3 == "default" && $5 == size { text[$1, $2] = sprintf("%.0e (%d; %.2g)", $11, $13 + $14, $7) }
         END { line = "| |"; rule = "|---|"
               for (m = 1; m <= count; m++) { line = line " " method[m] " |"; rule = rule "---|" }
               print line; print rule
               for (i = 1; i <= scenes; i++) { s = scene[i]; line = "| " s " |"
                   for (m = 1; m <= count; m++) line = line cell(method[m])
+                  print line } }' "$folder/work_precision.csv"
+    echo
+    echo "The default as pictures grow, in the same way, with the median of the seconds. Of pictures larger than 256 x 256 as"
+    echo "many pixels, spread evenly, are compared, and counted."
+    echo
+    awk -F , '
+        /^#/ || /^case/ { next }
+        $2 != "guarded" || $3 != "default" { next }
+        !($1 in place) { place[$1] = ++scenes; scene[scenes] = $1 }
+        !($5 in seen) { seen[$5] = ++sizes; size[sizes] = $5 }
+        { text[$1, $5] = sprintf("%.0e (%d; %.2g; %.2g s)", $11, $13 + $14, $7, $9) }
+        END { line = "| |"; rule = "|---|"
+              for (k = 1; k <= sizes; k++) { line = line " " size[k] " x " size[k] " |"; rule = rule "---|" }
+              print line; print rule
+              for (i = 1; i <= scenes; i++) { line = "| " scene[i] " |"
+                  for (k = 1; k <= sizes; k++) line = line " " text[scene[i], size[k]] " |"
                   print line } }' "$folder/work_precision.csv"
     echo
     echo "Each scene's default against the best of all rows of the paper's tracer, by each measure for itself: above the"

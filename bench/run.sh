@@ -1,6 +1,7 @@
 #!/bin/sh
 # All benchmarks in short, printed and written to bench/results: NAME.csv, whose first line names machine and commit,
-# and plots NAME*.svg (work_precision: into build; bench/results has that of make results). From the root of the repository, with the programs built in build/: make bench.
+# and plots NAME*.svg (work_precision: plots into build; bench/results has what make results makes). From the root of
+# the repository, with the programs built in build/: make bench.
 #
 #   sh bench/run.sh [NAME...]      all, or only these: net blas step trace grow scene needs fit work_precision code_size
 

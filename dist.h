@@ -1582,10 +1582,19 @@ DIST_API int dist_context_workers(const dist_context *ctx)
 /*@ 03 kernels ------------------------------------------------------------------------------------------------------ */
 
 /* Points stand in the lanes: activations of a block of DISTI_BLOCK points are rows [unit][DISTI_BLOCK], and a layer's
-   weights are packed in panels of eight outputs, element (o, k) at ((o / 8) * rows + k) * 8 + o % 8, so that one
-   broadcast serves a whole row. Nothing is ever transposed on the way forward; the reverse pass reads the same
-      packing. */
-enum { DISTI_BLOCK = 48 };
+   weights are packed in panels of DISTI_PANEL outputs, see disti_panel, so that one broadcast serves a whole row and an
+   input that is left out leaves out whole cache lines. Nothing is ever transposed on the way forward; the reverse pass
+   reads the same packing. */
+enum { DISTI_BLOCK = 48, DISTI_PANEL = 32 };
+
+/* Where output o's weight for input 0 stands; *stride is from one input to the next. A panel is (rows, stride): stride
+   is DISTI_PANEL, in the last panel what is left of `out` rounded up to a multiple of 8. */
+DISTI_INLINE size_t disti_panel(int rows, int out, int o, size_t *stride)
+{
+    const int first = o / DISTI_PANEL * DISTI_PANEL, left = (out + 7) / 8 * 8 - first;
+    *stride = (size_t)(unsigned)DISTI_MIN((int)DISTI_PANEL, left);
+    return (size_t)(unsigned)first * (size_t)(unsigned)rows + (size_t)(unsigned)(o - first);
+}
 
 /* forward   y[o][c] = bias[o] + sum_k weights(o, k) x[k][c]     k ascending over alive[0..alive_count-1], or all rows
              with relu or mask: y = max(0, y); bit c of mask[o] = y[o][c] > 0
@@ -1673,13 +1682,14 @@ static void disti_gemm_scalar(const disti_gemm *g)
 {
     const int count = g->alive ? g->alive_count : g->rows;
     for (int o = 0; o < (g->out + 7) / 8 * 8; o++) {
-        const float *w = g->weights + (size_t)(o / 8) * (size_t)g->rows * 8 + o % 8;
+        size_t stride;
+        const float *w = g->weights + disti_panel(g->rows, g->out, o, &stride);
         float *y = g->y + (size_t)o * DISTI_BLOCK;
         for (int c = 0; c < g->columns; c++) y[c] = g->bias[o];
         for (int i = 0; i < count; i++) {
             const size_t k = (size_t)(g->alive ? g->alive[i] : i);
             const float *x = g->x + k * DISTI_BLOCK;
-            for (int c = 0; c < g->columns; c++) y[c] += w[k * 8] * x[c];
+            for (int c = 0; c < g->columns; c++) y[c] += w[k * stride] * x[c];
         }
         uint64_t bits = 0;
         for (int c = 0; c < g->columns; c++) {
@@ -1701,9 +1711,10 @@ static void disti_gemm_back_scalar(const disti_gemm_back *g)
         float *d_x = g->d_x + k * DISTI_BLOCK;
         for (int c = 0; c < g->columns; c++) d_x[c] = 0.0f;
         for (int i = 0; i < out_count; i++) {
-            const size_t o = (size_t)(g->alive_out ? g->alive_out[i] : i);
-            const float w = g->weights[(o / 8 * (size_t)g->rows + k) * 8 + o % 8];
-            const float *d_y = g->d_y + o * DISTI_BLOCK;
+            const int o = g->alive_out ? g->alive_out[i] : i;
+            size_t stride;
+            const float *weights = g->weights + disti_panel(g->rows, g->out, o, &stride);
+            const float w = weights[k * stride], *d_y = g->d_y + (size_t)o * DISTI_BLOCK;
             for (int c = 0; c < g->columns; c++) d_x[c] += w * d_y[c];
         }
         if (!g->mask) continue;
@@ -1999,10 +2010,11 @@ static void disti_relu_scalar(size_t rows, float *y, uint64_t *mask)
 static void disti_bound_scalar(const disti_bound *g)
 {
     for (int o = 0; o < (g->out + 7) / 8 * 8; o++) {
-        const float *w = g->weights + (size_t)(o / 8) * (size_t)g->rows * 8 + o % 8;
+        size_t stride;
+        const float *w = g->weights + disti_panel(g->rows, g->out, o, &stride);
         float s[5] = {0, 0, 0, 0, 0};
         for (int i = 0; i < g->count; i++) {
-            const float v = w[(size_t)g->list[i] * 8], *m = g->model + (size_t)i * 8;
+            const float v = w[(size_t)g->list[i] * stride], *m = g->model + (size_t)i * 8;
             for (int j = 0; j < 4; j++) s[j] += v * m[j];
             s[4] += (v < 0.0f ? -v : v) * m[4];
         }
@@ -2145,7 +2157,6 @@ DISTI_PLAIN(scalar, static)
 #define DISTI_INPUT(i, j) const DISTI_VEC x##j = DISTI_LOAD(xs + j * DISTI_LANES);
 #define DISTI_MAC(i, j) DISTI_FMA(a##i##j, b, x##j);
 #define DISTI_SIDE(i, V) { const DISTI_VEC b = DISTI_SET1(ws[i]); DISTI_X##V(DISTI_MAC, i) }
-#define DISTI_ABOVE(i, V) { const DISTI_VEC b = DISTI_SET1(ws[(i) / 8 * panel + (i) % 8]); DISTI_X##V(DISTI_MAC, i) }
 #define DISTI_APART(i, V) { const DISTI_VEC b = DISTI_SET1(ws[k##i]); DISTI_X##V(DISTI_MAC, i) }
 #define DISTI_STEP(R, V, FACTORS, w, x) \
     { const float *const ws = w, *const xs = x; DISTI_X##V(DISTI_INPUT, 0) DISTI_Y##R(FACTORS, V) DISTI_FENCE }
@@ -2179,38 +2190,43 @@ DISTI_PLAIN(scalar, static)
 #define DISTI_STORE_POSITIVE(i, V) { const DISTI_VEC b = DISTI_SET1(bias[i]); DISTI_X##V(DISTI_STORE_POSITIVE1, i) }
 
 /* Takes inputs from..to-1 of the list or of all; between two passes over DISTI_DEPTH rows the sums wait in y.
-   Weights are fetched `ahead` floats early: a little, or a whole panel where passes cut the panels. */
+   Weights are fetched a panel early. Two tiles share a line: one fetches it for every other input, one for the rest,
+   which spreads what has to come from far away. */
 #define DISTI_GEMM_TILE(name, R, V, FACTORS)                                                                           \
-    DISTI_NOINLINE DISTI_FUNCTION void disti_gemm_##name(const disti_gemm *g, int o, int c, int from, int to,          \
-                                                          size_t ahead)                                                \
+    DISTI_NOINLINE DISTI_FUNCTION void disti_gemm_##name(const disti_gemm *g, int o, int c, int from, int to)          \
     {                                                                                                                  \
-        const size_t panel = (size_t)g->rows * 8, at = (size_t)(unsigned)o;                                            \
-        const float *w = g->weights + at / 8 * panel + at % 8;                                                         \
+        size_t stride;                                                                                                 \
+        const float *w = g->weights + disti_panel(g->rows, g->out, o, &stride);                                        \
         const float *x = g->x + c;                                                                                     \
         const float *bias = g->bias + o;                                                                               \
-        float *y = g->y + at * DISTI_BLOCK + c;                                                                        \
+        float *y = g->y + (size_t)(unsigned)o * DISTI_BLOCK + c;                                                       \
+        const size_t turn = (size_t)(unsigned)o / 8 % 2, ahead = (size_t)(unsigned)g->rows * DISTI_PANEL;              \
         DISTI_Y##R(DISTI_ZERO, V)                                                                                      \
         if (from > 0) {                                                                                                \
             DISTI_Y##R(DISTI_AGAIN, V)                                                                                 \
         }                                                                                                              \
         if (g->alive) {                                                                                                \
-            for (const int *alive = g->alive + from, *end = g->alive + to; alive < end; alive++) {                     \
+            const int *alive = g->alive + from, *end = g->alive + to;                                                  \
+            for (; DISTI_UNROLLED && end - alive >= 2; alive += 2) {                                                   \
+                const size_t k = (size_t)(unsigned)alive[0], next = (size_t)(unsigned)alive[1];                        \
+                DISTI_AHEAD(w + (size_t)(unsigned)alive[turn] * stride, ahead);                                        \
+                DISTI_STEP(R, V, FACTORS, w + k * stride, x + k * DISTI_BLOCK)                                         \
+                DISTI_STEP(R, V, FACTORS, w + next * stride, x + next * DISTI_BLOCK)                                   \
+            }                                                                                                          \
+            for (; alive < end; alive++) {                                                                             \
                 const size_t k = (size_t)(unsigned)*alive;                                                             \
-                DISTI_AHEAD(w + k * 8, ahead);                                                                         \
-                if (R > 8) DISTI_AHEAD(w + panel + k * 8, ahead);                                                      \
-                DISTI_STEP(R, V, FACTORS, w + k * 8, x + k * DISTI_BLOCK)                                              \
+                DISTI_STEP(R, V, FACTORS, w + k * stride, x + k * DISTI_BLOCK)                                         \
             }                                                                                                          \
         } else {                                                                                                       \
-            const float *end = w + (size_t)(unsigned)to * 8;                                                           \
-            w += (size_t)(unsigned)from * 8;                                                                           \
+            const float *end = x + (size_t)(unsigned)to * DISTI_BLOCK;                                                 \
+            w += (size_t)(unsigned)from * stride;                                                                      \
             x += (size_t)(unsigned)from * DISTI_BLOCK;                                                                 \
-            for (; DISTI_UNROLLED && end - w >= 2 * 8; w += 2 * 8, x += 2 * DISTI_BLOCK) {                             \
-                DISTI_AHEAD(w, ahead);                                                                                 \
-                if (R > 8) DISTI_AHEAD(w + panel, ahead);                                                              \
+            for (; DISTI_UNROLLED && end - x >= 2 * DISTI_BLOCK; w += 2 * stride, x += 2 * DISTI_BLOCK) {              \
+                DISTI_AHEAD(w, ahead + turn * stride);                                                                 \
                 DISTI_STEP(R, V, FACTORS, w, x)                                                                        \
-                DISTI_STEP(R, V, FACTORS, w + 8, x + DISTI_BLOCK)                                                      \
+                DISTI_STEP(R, V, FACTORS, w + stride, x + DISTI_BLOCK)                                                 \
             }                                                                                                          \
-            for (; w < end; w += 8, x += DISTI_BLOCK) DISTI_STEP(R, V, FACTORS, w, x)                                  \
+            for (; x < end; w += stride, x += DISTI_BLOCK) DISTI_STEP(R, V, FACTORS, w, x)                             \
         }                                                                                                              \
         if (to < (g->alive ? g->alive_count : g->rows)) {                                                              \
             DISTI_Y##R(DISTI_STORE_PART, V)                                                                            \
@@ -2225,11 +2241,12 @@ DISTI_PLAIN(scalar, static)
     }
 
 /* k: the rows of this tile; from `count` on they repeat the last one and are not stored. */
-#define DISTI_OFFSET(i, V) const size_t k##i = (size_t)(unsigned)k[i] * 8;
-#define DISTI_RETURN1(i, j) a##i##j = DISTI_LOAD(d_x + k##i * (DISTI_BLOCK / 8) + j * DISTI_LANES);
+#define DISTI_OFFSET(i, V) const size_t k##i = (size_t)(unsigned)k[i] * stride;
+#define DISTI_ROW(i) ((size_t)(unsigned)k[i] * DISTI_BLOCK)
+#define DISTI_RETURN1(i, j) a##i##j = DISTI_LOAD(d_x + DISTI_ROW(i) + j * DISTI_LANES);
 #define DISTI_RETURN(i, V) DISTI_X##V(DISTI_RETURN1, i)
 #define DISTI_STORE_KEEP1(i, j)                                                                                        \
-    DISTI_STORE(d_x + k##i * (DISTI_BLOCK / 8) + j * DISTI_LANES, DISTI_KEEP(a##i##j, bits >> (j * DISTI_LANES)));
+    DISTI_STORE(d_x + DISTI_ROW(i) + j * DISTI_LANES, DISTI_KEEP(a##i##j, bits >> (j * DISTI_LANES)));
 #define DISTI_STORE_KEEP(i, V)                                                                                         \
     if (i < count) {                                                                                                   \
         const uint64_t bits = g->mask ? g->mask[k[i]] >> c : ~(uint64_t)0;                                             \
@@ -2241,8 +2258,10 @@ DISTI_PLAIN(scalar, static)
                                                           int from, int to)                                            \
     {                                                                                                                  \
         const float *weights = g->weights, *d_y = g->d_y + c;                                                          \
-        const size_t panel = (size_t)g->rows * 8;                                                                      \
-        const float *next = weights + (size_t)(unsigned)k[R - 1] * 8 + 8;                                              \
+        const size_t panel = (size_t)(unsigned)g->rows * DISTI_PANEL;                                                  \
+        size_t stride;                                                                                                 \
+        disti_panel(g->rows, g->out, g->alive_out && to > from ? g->alive_out[from] : from, &stride);                  \
+        const float *next = weights + (size_t)(unsigned)k[R - 1] * stride + stride;                                    \
         float *d_x = g->d_x + c;                                                                                       \
         DISTI_Y##R(DISTI_OFFSET, V)                                                                                    \
         DISTI_Y##R(DISTI_ZERO, V)                                                                                      \
@@ -2251,20 +2270,21 @@ DISTI_PLAIN(scalar, static)
         }                                                                                                              \
         if (g->alive_out) {                                                                                            \
             for (const int *alive = g->alive_out + from, *end = g->alive_out + to; alive < end; alive++) {             \
-                const size_t o = (size_t)(unsigned)*alive;                                                             \
-                DISTI_AHEAD(next, (o >> 3) * panel + (o & 7) * 8);                                                     \
-                DISTI_STEP(R, V, DISTI_APART, weights + (o >> 3) * panel + (o & 7), d_y + o * DISTI_BLOCK)             \
+                const size_t o = (size_t)(unsigned)*alive, at = o / DISTI_PANEL * panel, column = o % DISTI_PANEL;     \
+                DISTI_AHEAD(next, at + column * 8);                                                                    \
+                DISTI_STEP(R, V, DISTI_APART, weights + at + column, d_y + o * DISTI_BLOCK)                            \
             }                                                                                                          \
         } else {                                                                                                       \
             size_t o = (size_t)(unsigned)from;                                                                         \
             const size_t end = (size_t)(unsigned)to;                                                                   \
-            const float *w = weights + (o >> 3) * panel, *x = d_y + o * DISTI_BLOCK;                                   \
-            next += (o >> 3) * panel;                                                                                  \
-            for (; DISTI_UNROLLED && o + 8 <= end; o += 8, w += panel - 8, next += panel) {                            \
-                DISTI_AHEAD(next, 0);                                                                                  \
-                DISTI_AHEAD(next, 16);                                                                                 \
-                DISTI_AHEAD(next, 32);                                                                                 \
-                DISTI_AHEAD(next, 48);                                                                                 \
+            const float *x = d_y + o * DISTI_BLOCK;                                                                    \
+            for (; DISTI_UNROLLED && o + 8 <= end; o += 8) {                                                           \
+                const size_t at = o / DISTI_PANEL * panel, column = o % DISTI_PANEL;                                   \
+                const float *w = weights + at + column;                                                                \
+                DISTI_AHEAD(next, at + column * 8);                                                                    \
+                DISTI_AHEAD(next, at + column * 8 + 16);                                                               \
+                DISTI_AHEAD(next, at + column * 8 + 32);                                                               \
+                DISTI_AHEAD(next, at + column * 8 + 48);                                                               \
                 for (int half = 0; half < 2; half++, w += 4, x += 4 * DISTI_BLOCK) {                                   \
                     DISTI_STEP(R, V, DISTI_APART, w, x)                                                                \
                     DISTI_STEP(R, V, DISTI_APART, w + 1, x + DISTI_BLOCK)                                              \
@@ -2273,7 +2293,8 @@ DISTI_PLAIN(scalar, static)
                 }                                                                                                      \
             }                                                                                                          \
             for (; o < end; o++)                                                                                       \
-                DISTI_STEP(R, V, DISTI_APART, weights + (o >> 3) * panel + (o & 7), d_y + o * DISTI_BLOCK)             \
+                DISTI_STEP(R, V, DISTI_APART, weights + o / DISTI_PANEL * panel + o % DISTI_PANEL,                     \
+                           d_y + o * DISTI_BLOCK)                                                                      \
         }                                                                                                              \
         DISTI_Y##R(DISTI_STORE_KEEP, V)                                                                                \
     }
@@ -2398,7 +2419,6 @@ DISTI_PLAIN(scalar, static)
     DISTI_FUNCTION void disti_gemm_##isa(const disti_gemm *g)                                                          \
     {                                                                                                                  \
         const int count = g->alive ? g->alive_count : g->rows, out = (g->out + 7) / 8 * 8;                             \
-        const size_t ahead = count > DISTI_DEPTH ? (size_t)g->rows * 8 : 256;                                          \
         if (g->mask) memset(g->mask, 0, (size_t)(unsigned)out * sizeof(uint64_t));                                     \
         int to = 0;                                                                                                    \
         do {                                                                                                           \
@@ -2406,7 +2426,7 @@ DISTI_PLAIN(scalar, static)
             to = DISTI_MIN(from + DISTI_DEPTH, count);                                                                 \
             int first = 0;                                                                                             \
             DISTI_TALL(isa)                                                                                            \
-            DISTI_EACH(gemm, isa, first, out, g->columns, R, W, (g, n, c, from, to, ahead))                            \
+            DISTI_EACH(gemm, isa, first, out, g->columns, R, W, (g, n, c, from, to))                            \
         } while (to < count);                                                                                          \
         if (!g->mask || g->columns == DISTI_BLOCK) return;                                                             \
         for (int o = 0; o < out; o++) g->mask[o] &= ((uint64_t)1 << g->columns) - 1;                                   \
@@ -2415,10 +2435,11 @@ DISTI_PLAIN(scalar, static)
     {                                                                                                                  \
         const int rows = g->alive_rows ? g->alive_rows_count : g->rows;                                                \
         const int count = g->alive_out ? g->alive_out_count : g->out;                                                  \
+        const int full = disti_back_full(g, count);                                                                    \
         int to = 0, k[8];                                                                                              \
         do {                                                                                                           \
             const int from = to;                                                                                       \
-            to = DISTI_MIN(from + DISTI_DEPTH, count);                                                                 \
+            to = DISTI_MIN(from + DISTI_DEPTH, from < full ? full : count);                                            \
             DISTI_FEW(isa)                                                                                             \
             DISTI_EACH(back, isa, 0, rows, g->columns, R, W,                                                           \
                        (g, disti_back_rows(g, rows, n, k), rows - n, c, from, to))                                     \
@@ -2442,26 +2463,24 @@ DISTI_PLAIN(scalar, static)
         }                                                                                                              \
     }
 
-/* Two vectors of outputs at a time: of two panels, or of one where a vector is half a panel. */
+/* Two vectors of outputs at a time, those from `first` to end - 1; their number is a multiple of a vector's. */
 #define DISTI_BOUND1(j)                                                                                                \
     { const DISTI_VEC b = DISTI_SET1(m[j]); DISTI_FMA(a0##j, b, v); DISTI_FMA(a1##j, b, w); }
 #define DISTI_BOUND_ZERO(j) DISTI_VEC a0##j = DISTI_SET1(0.0f), a1##j = DISTI_SET1(0.0f);
 #define DISTI_BOUND_STORE(j) DISTI_STORE(s + j * g->stride, a0##j); DISTI_STORE(t + j * g->stride, a1##j);
 #define DISTI_BOUND(isa)                                                                                               \
-    DISTI_NOINLINE DISTI_FUNCTION void disti_bound_##isa(const disti_bound *g)                                         \
+    DISTI_NOINLINE DISTI_FUNCTION void disti_bounds_##isa(const disti_bound *g, int first, int end)                    \
     {                                                                                                                  \
-        const int panels = (g->out + 7) / 8;                                                                           \
-        const size_t panel = (size_t)g->rows * 8;                                                                      \
-        for (int p = 0; p < panels; p += DISTI_LANES / 4) {                                                            \
-            const size_t other = (size_t)(unsigned)(DISTI_LANES == 8 ? DISTI_MIN(p + 1, panels - 1) : p);              \
-            const size_t half = DISTI_LANES == 8 ? 0 : 4;                                                              \
-            const float *w0 = g->weights + (size_t)(unsigned)p * panel, *w1 = g->weights + other * panel + half;       \
+        for (int o = first; o < end; o += 2 * DISTI_LANES) {                                                           \
+            const int other = o + DISTI_LANES < end ? DISTI_LANES : 0;                                                 \
+            size_t stride;                                                                                             \
+            const float *w0 = g->weights + disti_panel(g->rows, g->out, o, &stride), *w1 = w0 + other;                 \
             const float *m = g->model;                                                                                 \
-            float *s = g->sum + (size_t)(unsigned)p * 8, *t = g->sum + other * 8 + half;                               \
+            float *s = g->sum + o, *t = s + other;                                                                     \
             DISTI_BOUND_ZERO(0) DISTI_BOUND_ZERO(1) DISTI_BOUND_ZERO(2) DISTI_BOUND_ZERO(3) DISTI_BOUND_ZERO(4)        \
-            for (const int *k = g->list, *end = k + g->count; k < end; k++, m += 8) {                                  \
-                DISTI_VEC v = DISTI_LOAD(w0 + (size_t)(unsigned)*k * 8);                                               \
-                DISTI_VEC w = DISTI_LOAD(w1 + (size_t)(unsigned)*k * 8);                                               \
+            for (const int *k = g->list, *last = k + g->count; k < last; k++, m += 8) {                                \
+                DISTI_VEC v = DISTI_LOAD(w0 + (size_t)(unsigned)*k * stride);                                          \
+                DISTI_VEC w = DISTI_LOAD(w1 + (size_t)(unsigned)*k * stride);                                          \
                 DISTI_BOUND1(0) DISTI_BOUND1(1) DISTI_BOUND1(2) DISTI_BOUND1(3)                                        \
                 v = DISTI_ABS(v);                                                                                      \
                 w = DISTI_ABS(w);                                                                                      \
@@ -2469,6 +2488,12 @@ DISTI_PLAIN(scalar, static)
             }                                                                                                          \
             DISTI_BOUND_STORE(0) DISTI_BOUND_STORE(1) DISTI_BOUND_STORE(2) DISTI_BOUND_STORE(3) DISTI_BOUND_STORE(4)   \
         }                                                                                                              \
+    }                                                                                                                  \
+    DISTI_FUNCTION void disti_bound_##isa(const disti_bound *g)                                                        \
+    {                                                                                                                  \
+        const int out = (g->out + 7) / 8 * 8, whole = out / DISTI_LANES * DISTI_LANES;                                 \
+        disti_bounds_##isa(g, 0, whole);                                                                               \
+        DISTI_BOUND_REST                                                                                               \
     }
 
 #define DISTI_KERNELS(isa, R, W)                                                                                       \
@@ -2485,6 +2510,15 @@ DISTI_PLAIN(scalar, static)
     DISTI_RELU_ROWS(isa)                                                                                               \
     DISTI_PLAIN(isa, DISTI_LOOPS DISTI_FUNCTION)                                                                       \
     DISTI_DRIVERS(isa, R, W)
+
+/* How many of the `count` outputs are in full panels: a pass does not go beyond, since the last one's stride is its own. */
+static int disti_back_full(const disti_gemm_back *g, int count)
+{
+    const int end = g->out / DISTI_PANEL * DISTI_PANEL;
+    if ((g->out + 7) / 8 * 8 <= DISTI_MAX(end, (int)DISTI_PANEL)) return count;
+    while (count > 0 && (g->alive_out ? g->alive_out[count - 1] : count - 1) >= end) count--;
+    return count;
+}
 
 /* The eight rows of d_x that begin at the list's entry n; beyond its end the last one again. */
 static const int *disti_back_rows(const disti_gemm_back *g, int rows, int n, int *k)
@@ -2521,6 +2555,7 @@ DISTI_FUNCTION __m128 disti_keep_sse2(__m128 v, int bits)
 #define DISTI_DEPTH 112
 DISTI_KERNELS(sse2, 4, 2)
 #define DISTI_ABS(v) _mm_andnot_ps(_mm_set1_ps(-0.0f), v)
+#define DISTI_BOUND_REST
 DISTI_BOUND(sse2)
 #undef DISTI_ABS
 #undef DISTI_FUNCTION
@@ -2602,8 +2637,8 @@ DISTI_BOUND(avx2)
 /* Eight sums are too few to hide the latency of a multiply-add. */
 #define DISTI_TALL(isa)                                                                                                \
     for (; g->columns <= DISTI_LANES && first + 16 <= out; first += 16)                                                \
-        disti_gemm_tall_##isa(g, first, 0, from, to, ahead);
-DISTI_GEMM_TILE(tall_avx512, 16, 1, DISTI_ABOVE)
+        disti_gemm_tall_##isa(g, first, 0, from, to);
+DISTI_GEMM_TILE(tall_avx512, 16, 1, DISTI_SIDE)
 #define DISTI_FEW(isa)                                                                                                 \
     if (rows > 0 && rows <= 4 && g->columns > 2 * DISTI_LANES) {                                                       \
         disti_back_few_##isa(g, disti_back_rows(g, rows, 0, k), rows, 0, from, to);                                    \
@@ -2611,6 +2646,12 @@ DISTI_GEMM_TILE(tall_avx512, 16, 1, DISTI_ABOVE)
     }
 DISTI_BACK_TILE(few_avx512, 4, 3)
 DISTI_KERNELS(avx512, 8, 3)
+#define DISTI_ABS(v) _mm512_castsi512_ps(_mm512_and_si512(_mm512_castps_si512(v), _mm512_set1_epi32(0x7fffffff)))
+#undef DISTI_BOUND_REST
+#define DISTI_BOUND_REST disti_bounds_avx2(g, whole, out);
+DISTI_BOUND(avx512)
+#undef DISTI_ABS
+#undef DISTI_BOUND_REST
 #undef DISTI_TALL
 #undef DISTI_FEW
 
@@ -2625,7 +2666,7 @@ DISTI_KERNELS(avx512, 8, 3)
    Steps of y that are not zero everywhere are appended to y_alive. bad: a sum was not finite. */
 typedef struct disti_half {
     const float *weights;    /* panels (out / 8, steps, 8) of 32 bits */
-    const float *point_weights, *bias; /* point_weights: of the first panel, (point, 8) */
+    const float *point_weights, *bias; /* point_weights: panels in f32, the last `point` inputs are used */
     const float *points[2];  /* (point, B) of the first and second 48 columns */
     const float *x;          /* (steps, B) of 32 bits */
     const int *alive;        /* NULL: all steps */
@@ -2634,8 +2675,7 @@ typedef struct disti_half {
     int *y_alive;
     void (*activate)(int activation, float scale, size_t n, float *y, float *slope); /* NULL: ReLU */
     float scale;
-    size_t panel;            /* floats from one panel of point_weights to the next */
-    int activation, steps, alive_count, point, out, columns, y_alive_count, bad;
+    int activation, steps, alive_count, panel_rows, point, out, columns, y_alive_count, bad;
 } disti_half;
 
 #define DISTI_CELL(c) ((c) / DISTI_BLOCK)
@@ -2646,15 +2686,17 @@ typedef struct disti_half {
         float sums[8 * DISTI_COLUMNS];                                                                                 \
         const size_t n = DISTI_WIDEN * V * 16, at = (size_t)(unsigned)o;                                               \
         const int *alive = g->alive, *const alive_end = alive ? alive + g->alive_count : NULL;                         \
-        const float *factors = g->point_weights + at / 8 * g->panel;                                                   \
+        size_t stride;                                                                                                 \
+        const float *factors = g->point_weights + disti_panel(g->panel_rows, g->out, o, &stride);                      \
         const float *const weights = g->weights + at * (size_t)(unsigned)g->steps;                                     \
+        factors += (size_t)(unsigned)(g->panel_rows - g->point) * stride;                                              \
         for (size_t i = 0; i < 8; i++) {                                                                               \
             for (size_t c = 0; c < n; c += 16) {                                                                       \
                 const float *p = g->points[DISTI_CELL(c)] + c % DISTI_BLOCK;                                           \
                 __m512 sum = _mm512_set1_ps(g->bias[at + i]);                                                          \
                 for (size_t j = 0; j < (size_t)(unsigned)g->point; j++)                                                \
-                    sum = _mm512_fmadd_ps(_mm512_set1_ps(factors[j * 8 + i]), _mm512_loadu_ps(p + j * DISTI_BLOCK),    \
-                                          sum);                                                                        \
+                    sum = _mm512_fmadd_ps(_mm512_set1_ps(factors[j * stride + i]),                                     \
+                                          _mm512_loadu_ps(p + j * DISTI_BLOCK), sum);                                  \
                 _mm512_storeu_ps(sums + i * DISTI_COLUMNS + c, sum);                                                   \
             }                                                                                                          \
         }                                                                                                              \
@@ -2836,6 +2878,7 @@ static float32x4_t disti_keep_neon(float32x4_t v, uint32_t bits)
 #define DISTI_FEW(isa)
 #define DISTI_DEPTH 112
 DISTI_KERNELS(neon, 8, 3)
+#define DISTI_BOUND_REST
 #define DISTI_ABS(v) vabsq_f32(v)
 DISTI_BOUND(neon)
 #undef DISTI_ABS
@@ -2857,6 +2900,7 @@ static uint32_t disti_f16_bits(float x) /* not called: dist_net_set_half refuses
 
 #define DISTI_TABLE(isa) \
     kernels.gemm = disti_gemm_##isa; \
+    kernels.bound = disti_bound_##isa; \
     kernels.gemm_back = disti_gemm_back_##isa; \
     kernels.gemm_weights = disti_gemm_weights_##isa; \
     kernels.dot = disti_dot_##isa; \
@@ -2877,16 +2921,13 @@ static disti_kernels disti_kernels_for(int isa)
 {
     disti_kernels kernels;
     DISTI_TABLE(scalar)
-    kernels.bound = disti_bound_scalar;
 #ifdef DISTI_X86
     if (isa == DIST_ISA_SSE2) { DISTI_TABLE(sse2) }
     if (isa == DIST_ISA_AVX2) { DISTI_TABLE(avx2) }
     if (isa == DIST_ISA_AVX512) { DISTI_TABLE(avx512) }
-    if (isa == DIST_ISA_SSE2) kernels.bound = disti_bound_sse2;
-    if (isa == DIST_ISA_AVX2 || isa == DIST_ISA_AVX512) kernels.bound = disti_bound_avx2;
 #endif
 #ifdef DISTI_NEON
-    if (isa == DIST_ISA_NEON) { DISTI_TABLE(neon) kernels.bound = disti_bound_neon; }
+    if (isa == DIST_ISA_NEON) { DISTI_TABLE(neon) }
 #endif
     (void)isa;
     return kernels;
@@ -2908,7 +2949,6 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_MAC
 #undef DISTI_SIDE
 #undef DISTI_APART
-#undef DISTI_ABOVE
 #undef DISTI_STEP
 #undef DISTI_FENCE
 #undef DISTI_UNROLLED
@@ -2924,6 +2964,7 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_STORE_RELU
 #undef DISTI_GEMM_TILE
 #undef DISTI_OFFSET
+#undef DISTI_ROW
 #undef DISTI_RETURN1
 #undef DISTI_RETURN
 #undef DISTI_STORE_KEEP1
@@ -6168,25 +6209,25 @@ static void disti_group_pack(const dist_shape *shape, disti_group *g, int l, int
 {
     const dist_net *net = shape->net;
     const disti_linear *layer = &net->layer[l];
-    size_t panel = (size_t)(layer->prev + layer->point) * 8;
     for (int o = 0; o < out; o += 8) {
         const float *from[8];
-        float *row = g->panels + (size_t)o * (size_t)g->count;
+        size_t stride[8], to;
+        float *row = g->panels + disti_panel(g->count, out, o, &to);
         for (int i = 0; i < 8; i++) {
-            size_t u = (size_t)unit[DISTI_MIN(o + i, out - 1)];
-            from[i] = net->panels + layer->panel + u / 8 * panel + u % 8;
-            g->bias[o + i] = shape->bias[(size_t)l * (size_t)net->max_rows + u];
+            int u = unit[DISTI_MIN(o + i, out - 1)];
+            from[i] = net->panels + layer->panel + disti_panel(layer->prev + layer->point, layer->out, u, &stride[i]);
+            g->bias[o + i] = shape->bias[(size_t)l * (size_t)net->max_rows + (size_t)u];
         }
-        for (int j = 0; j < g->count; j++, row += 8) {
-            const size_t k = (size_t)g->list[j] * 8;
-            row[0] = from[0][k];
-            row[1] = from[1][k];
-            row[2] = from[2][k];
-            row[3] = from[3][k];
-            row[4] = from[4][k];
-            row[5] = from[5][k];
-            row[6] = from[6][k];
-            row[7] = from[7][k];
+        for (int j = 0; j < g->count; j++, row += to) {
+            const size_t k = (size_t)g->list[j];
+            row[0] = from[0][k * stride[0]];
+            row[1] = from[1][k * stride[1]];
+            row[2] = from[2][k * stride[2]];
+            row[3] = from[3][k * stride[3]];
+            row[4] = from[4][k * stride[4]];
+            row[5] = from[5][k * stride[5]];
+            row[6] = from[6][k * stride[6]];
+            row[7] = from[7][k * stride[7]];
         }
     }
 }
@@ -6344,12 +6385,11 @@ static void disti_half_hidden(const dist_shape *shape, const disti_kernels *kern
 {
     const dist_net *net = shape->net;
     const disti_linear *layer = &net->layer[l];
-    size_t rows = (size_t)(layer->prev + layer->point);
     int last = l + 2 == net->layers, pairs = net->half == DIST_HALF_BF16;
     h->steps = pairs ? (layer->prev + 1) / 2 : layer->prev;
     h->weights = net->half_panels + layer->half_panel;
-    h->point_weights = net->panels + layer->panel + (size_t)layer->prev * 8;
-    h->panel = rows * 8;
+    h->point_weights = net->panels + layer->panel;
+    h->panel_rows = layer->prev + layer->point;
     h->point = layer->point;
     h->bias = shape->bias + (size_t)l * (size_t)net->max_rows;
     h->x = b->act[l & 1];
@@ -7146,10 +7186,10 @@ static float disti_half_largest(const dist_net *net)
     float largest = 0.0f;
     for (int l = 1; l + 1 < net->layers; l++) {
         const disti_linear *layer = &net->layer[l];
-        size_t rows = (size_t)(layer->prev + layer->point), count = disti_round_up((size_t)layer->out, 8) * rows;
-        for (size_t i = 0; i < count; i++) {
-            float w = net->panels[layer->panel + i];
-            if (i / 8 % rows < (size_t)layer->prev) largest = DISTI_MAX(largest, w < 0.0f ? -w : w);
+        for (int o = 0; o < layer->out; o++) {
+            size_t stride, at = disti_panel(layer->prev + layer->point, layer->out, o, &stride);
+            for (size_t k = 0; k < (size_t)layer->prev; k++)
+                largest = DISTI_MAX(largest, fabsf(net->panels[layer->panel + at + k * stride]));
         }
     }
     return largest;
@@ -7161,18 +7201,20 @@ static void disti_half_pack(dist_net *net)
     size_t offset = 0;
     for (int l = 0; l + 1 < net->layers; l++) {
         disti_linear *layer = &net->layer[l];
-        size_t rows = (size_t)(layer->prev + layer->point), steps = disti_half_steps(layer, net->half);
+        size_t steps = disti_half_steps(layer, net->half);
         layer->half_panel = offset;
         offset += disti_half_size(layer, net->half);
         for (size_t o = 0; o < (size_t)layer->out; o += 8) {
+            size_t stride;
+            const float *w = net->panels + layer->panel +
+                             disti_panel(layer->prev + layer->point, layer->out, (int)o, &stride);
             for (size_t at = 0; at < steps * 8; at++) {
-                const float *w = net->panels + layer->panel + o * rows;
                 uint32_t bits[2] = {0, 0};
                 if (net->half == DIST_HALF_F16) {
-                    bits[0] = bits[1] = disti_f16_bits(w[at]);
+                    bits[0] = bits[1] = disti_f16_bits(w[at / 8 * stride + at % 8]);
                 } else {
                     for (size_t i = 0; i < 2 && 2 * (at / 8) + i < (size_t)layer->prev; i++) {
-                        memcpy(&bits[i], w + (2 * (at / 8) + i) * 8 + at % 8, sizeof *bits);
+                        memcpy(&bits[i], w + (2 * (at / 8) + i) * stride + at % 8, sizeof *bits);
                         bits[i] = (bits[i] + 0x7fff + (bits[i] >> 16 & 1)) >> 16;
                     }
                 }
@@ -7193,10 +7235,11 @@ static void disti_net_pack(dist_net *net)
         int last = l + 1 == net->layers;
         for (size_t o = 0; o < (size_t)layer->out; o++) {
             const float *w = net->params + layer->weight + o * (size_t)layer->in;
+            size_t stride, first = disti_panel((int)rows, layer->out, (int)o, &stride);
             for (size_t k = 0; k < rows; k++) {
                 size_t column = k < (size_t)layer->prev ? (size_t)layer->x_column + k
                                                         : (size_t)layer->point_column + k - (size_t)layer->prev;
-                size_t at = last ? o * rows + k : (o / 8 * rows + k) * 8 + o % 8;
+                size_t at = last ? o * rows + k : first + k * stride;
                 net->panels[layer->panel + at] = layer->scale * w[column];
             }
         }

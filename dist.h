@@ -2128,6 +2128,7 @@ DISTI_PLAIN(scalar, static)
      DISTI_RELU(v) DISTI_POSITIVE(v)    max(v, 0), and the bits of the lanes that are greater than 0
      DISTI_BITS(row, column, v)         the latter into a mask's row, from this column on
      DISTI_KEEP(v, bits)                v with 0 where the lane's bit is 0
+     DISTI_FLAT, DISTI_FLAT_MORE(isa)   so many points at most go to DISTI_FLAT_TILEs, more than one to these
      DISTI_TALL(isa)                    tiles of one vector's columns, where there are registers for sixteen rows
      DISTI_FEW(isa)                     the reverse pass of up to four rows, where other tiles are higher
      DISTI_DEPTH                        rows that one pass takes: the columns of a tile in them, 128 bytes of a row
@@ -2172,6 +2173,7 @@ DISTI_PLAIN(scalar, static)
 
 /* Prefetches reach beyond the end of an array, where a pointer may not go. */
 #define DISTI_AHEAD(p, floats) DISTI_PREFETCH((const char *)((uintptr_t)(p) + sizeof(float) * (size_t)(floats)))
+#define DISTI_AFTER(p, floats) DISTI_PREFETCH_FAR((const char *)((uintptr_t)(p) + sizeof(float) * (size_t)(floats)))
 #define DISTI_VECTORS(floats) (((floats) + DISTI_LANES - 1) / DISTI_LANES)
 
 #define DISTI_STORE_RELU1(i, j)                                                                                        \
@@ -2190,8 +2192,8 @@ DISTI_PLAIN(scalar, static)
 #define DISTI_STORE_POSITIVE(i, V) { const DISTI_VEC b = DISTI_SET1(bias[i]); DISTI_X##V(DISTI_STORE_POSITIVE1, i) }
 
 /* Takes inputs from..to-1 of the list or of all; between two passes over DISTI_DEPTH rows the sums wait in y.
-   Weights are fetched a panel early. Two tiles share a line: one fetches it for every other input, one for the rest,
-   which spreads what has to come from far away. */
+   Weights are fetched a panel early, into the second cache. Two tiles share a line: one fetches it for every other
+   input, one for the rest, which spreads what has to come from far away. */
 #define DISTI_GEMM_TILE(name, R, V, FACTORS)                                                                           \
     DISTI_NOINLINE DISTI_FUNCTION void disti_gemm_##name(const disti_gemm *g, int o, int c, int from, int to)          \
     {                                                                                                                  \
@@ -2209,12 +2211,13 @@ DISTI_PLAIN(scalar, static)
             const int *alive = g->alive + from, *end = g->alive + to;                                                  \
             for (; DISTI_UNROLLED && end - alive >= 2; alive += 2) {                                                   \
                 const size_t k = (size_t)(unsigned)alive[0], next = (size_t)(unsigned)alive[1];                        \
-                DISTI_AHEAD(w + (size_t)(unsigned)alive[turn] * stride, ahead);                                        \
+                DISTI_AFTER(w + (size_t)(unsigned)alive[turn] * stride, ahead);                                        \
                 DISTI_STEP(R, V, FACTORS, w + k * stride, x + k * DISTI_BLOCK)                                         \
                 DISTI_STEP(R, V, FACTORS, w + next * stride, x + next * DISTI_BLOCK)                                   \
             }                                                                                                          \
             for (; alive < end; alive++) {                                                                             \
                 const size_t k = (size_t)(unsigned)*alive;                                                             \
+                DISTI_AFTER(w + k * stride, ahead);                                                                    \
                 DISTI_STEP(R, V, FACTORS, w + k * stride, x + k * DISTI_BLOCK)                                         \
             }                                                                                                          \
         } else {                                                                                                       \
@@ -2222,11 +2225,14 @@ DISTI_PLAIN(scalar, static)
             w += (size_t)(unsigned)from * stride;                                                                      \
             x += (size_t)(unsigned)from * DISTI_BLOCK;                                                                 \
             for (; DISTI_UNROLLED && end - x >= 2 * DISTI_BLOCK; w += 2 * stride, x += 2 * DISTI_BLOCK) {              \
-                DISTI_AHEAD(w, ahead + turn * stride);                                                                 \
+                DISTI_AFTER(w, ahead + turn * stride);                                                                 \
                 DISTI_STEP(R, V, FACTORS, w, x)                                                                        \
                 DISTI_STEP(R, V, FACTORS, w + stride, x + DISTI_BLOCK)                                                 \
             }                                                                                                          \
-            for (; x < end; w += stride, x += DISTI_BLOCK) DISTI_STEP(R, V, FACTORS, w, x)                             \
+            for (; x < end; w += stride, x += DISTI_BLOCK) {                                                           \
+                DISTI_AFTER(w, ahead);                                                                                 \
+                DISTI_STEP(R, V, FACTORS, w, x)                                                                        \
+            }                                                                                                          \
         }                                                                                                              \
         if (to < (g->alive ? g->alive_count : g->rows)) {                                                              \
             DISTI_Y##R(DISTI_STORE_PART, V)                                                                            \
@@ -2237,6 +2243,49 @@ DISTI_PLAIN(scalar, static)
             DISTI_Y##R(DISTI_STORE_RELU, V)                                                                            \
         } else {                                                                                                       \
             DISTI_Y##R(DISTI_STORE_POSITIVE, V)                                                                        \
+        }                                                                                                              \
+    }
+
+/* At most R points: the lanes are outputs, the points stand in the factors, so that hardly a lane is idle. The sums are
+   those of the other tiles in the same order. Takes the first `out` outputs, a multiple of two vectors. */
+#define DISTI_FLAT_SUM1(i, j)                                                                                          \
+    a##i##j = DISTI_ADD(DISTI_ADD(a##i##j, DISTI_LOAD(g->bias + o + j * DISTI_LANES)), DISTI_SET1(0.0f));              \
+    DISTI_STORE(part + (2 * (i) + j) * DISTI_LANES, positive ? DISTI_RELU(a##i##j) : a##i##j);
+#define DISTI_FLAT_SUM(i, V) DISTI_X##V(DISTI_FLAT_SUM1, i)
+#define DISTI_TURN1(i, V)                                                                                              \
+    for (int j = 0; j < 4; j++) {                                                                                      \
+        y[j * DISTI_BLOCK] = part[n + j];                                                                              \
+        bits[j] = part[n + j] > 0.0f;                                                                                  \
+    }
+#define DISTI_TURN4(i, V) if ((i) % 4 == 0) DISTI_TURN(i, part + 2 * (i) * DISTI_LANES + n)
+#define DISTI_TURN8(i, V) DISTI_TURN4(i, V)
+#define DISTI_FLAT_TILE(name, R)                                                                                       \
+    DISTI_NOINLINE DISTI_FUNCTION void disti_flat_##name(const disti_gemm *g, int out)                                 \
+    {                                                                                                                  \
+        const int positive = g->mask || g->relu;                                                                       \
+        float part[2 * R * DISTI_LANES];                                                                               \
+        for (int o = 0; o < out; o += 2 * DISTI_LANES) {                                                               \
+            size_t stride;                                                                                             \
+            const float *w = g->weights + disti_panel(g->rows, g->out, o, &stride), *x = g->x;                         \
+            float *y = g->y + (size_t)(unsigned)o * DISTI_BLOCK;                                                       \
+            DISTI_Y##R(DISTI_ZERO, 2)                                                                                  \
+            if (g->alive) {                                                                                            \
+                for (const int *alive = g->alive, *end = alive + g->alive_count; alive < end; alive++) {               \
+                    const size_t k = (size_t)(unsigned)*alive;                                                         \
+                    const float *next = w + (size_t)(unsigned)(end - alive > 12 ? alive[12] : end[-1]) * stride;       \
+                    DISTI_AHEAD(next, 0);                                                                              \
+                    DISTI_AHEAD(next, 2 * DISTI_LANES - 1);                                                            \
+                    DISTI_STEP(R, 2, DISTI_SIDE, x + k * DISTI_BLOCK, w + k * stride)                                  \
+                }                                                                                                      \
+            } else {                                                                                                   \
+                for (int k = 0; k < g->rows; k++, x += DISTI_BLOCK, w += stride) DISTI_STEP(R, 2, DISTI_SIDE, x, w)    \
+            }                                                                                                          \
+            DISTI_Y##R(DISTI_FLAT_SUM, 2)                                                                              \
+            for (int n = 0; n < 2 * DISTI_LANES; n += 4, y += 4 * DISTI_BLOCK) {                                       \
+                unsigned bits[4] = {0, 0, 0, 0};                                                                       \
+                DISTI_Y##R(DISTI_TURN##R, 2)                                                                           \
+                for (int i = 0; i < 4 && g->mask; i++) g->mask[o + n + i] = bits[i];                                   \
+            }                                                                                                          \
         }                                                                                                              \
     }
 
@@ -2420,13 +2469,16 @@ DISTI_PLAIN(scalar, static)
     {                                                                                                                  \
         const int count = g->alive ? g->alive_count : g->rows, out = (g->out + 7) / 8 * 8;                             \
         if (g->mask) memset(g->mask, 0, (size_t)(unsigned)out * sizeof(uint64_t));                                     \
+        const int flat = g->columns <= DISTI_FLAT ? out / (2 * DISTI_LANES) * (2 * DISTI_LANES) : 0;                   \
         int to = 0;                                                                                                    \
+        if (flat > 0 && g->columns == 1) disti_flat_one_##isa(g, flat);                                                \
+        DISTI_FLAT_MORE(isa)                                                                                           \
         do {                                                                                                           \
             const int from = to;                                                                                       \
             to = DISTI_MIN(from + DISTI_DEPTH, count);                                                                 \
-            int first = 0;                                                                                             \
+            int first = flat;                                                                                          \
             DISTI_TALL(isa)                                                                                            \
-            DISTI_EACH(gemm, isa, first, out, g->columns, R, W, (g, n, c, from, to))                            \
+            DISTI_EACH(gemm, isa, first, out, g->columns, R, W, (g, n, c, from, to))                                   \
         } while (to < count);                                                                                          \
         if (!g->mask || g->columns == DISTI_BLOCK) return;                                                             \
         for (int o = 0; o < out; o++) g->mask[o] &= ((uint64_t)1 << g->columns) - 1;                                   \
@@ -2500,6 +2552,7 @@ DISTI_PLAIN(scalar, static)
     DISTI_GEMM_TILE(wide_##isa, R, W, DISTI_SIDE)                                                                      \
     DISTI_GEMM_TILE(middle_##isa, 8, 2, DISTI_SIDE)                                                                    \
     DISTI_GEMM_TILE(narrow_##isa, 8, 1, DISTI_SIDE)                                                                    \
+    DISTI_FLAT_TILE(one_##isa, 1)                                                                                      \
     DISTI_BACK_TILE(wide_##isa, R, W)                                                                                  \
     DISTI_BACK_TILE(middle_##isa, 8, 2)                                                                                \
     DISTI_BACK_TILE(narrow_##isa, 8, 1)                                                                                \
@@ -2511,7 +2564,7 @@ DISTI_PLAIN(scalar, static)
     DISTI_PLAIN(isa, DISTI_LOOPS DISTI_FUNCTION)                                                                       \
     DISTI_DRIVERS(isa, R, W)
 
-/* How many of the `count` outputs are in full panels: a pass does not go beyond, since the last one's stride is its own. */
+/* How many of the `count` outputs stand in full panels: a pass ends there, since the last one's stride is its own. */
 static int disti_back_full(const disti_gemm_back *g, int count)
 {
     const int end = g->out / DISTI_PANEL * DISTI_PANEL;
@@ -2532,6 +2585,22 @@ static const int *disti_back_rows(const disti_gemm_back *g, int rows, int n, int
 
 #ifdef DISTI_X86
 #define DISTI_PREFETCH(p) _mm_prefetch(p, _MM_HINT_T0)
+#define DISTI_PREFETCH_FAR(p) _mm_prefetch(p, _MM_HINT_T1)
+/* Four points from i on of four outputs, the points two vectors apart, to four rows and their bits. */
+#define DISTI_TURNED(i, j, v)                                                                                          \
+    _mm_storeu_ps(y + (i) + (j) * DISTI_BLOCK, v);                                                                     \
+    bits[j] |= (unsigned)_mm_movemask_ps(_mm_cmpgt_ps(v, _mm_setzero_ps())) << (i);
+#define DISTI_TURN(i, from)                                                                                            \
+    {                                                                                                                  \
+        const __m128 r0 = _mm_loadu_ps(from), r1 = _mm_loadu_ps(from + 2 * DISTI_LANES);                               \
+        const __m128 r2 = _mm_loadu_ps(from + 4 * DISTI_LANES), r3 = _mm_loadu_ps(from + 6 * DISTI_LANES);             \
+        const __m128 low0 = _mm_unpacklo_ps(r0, r1), low1 = _mm_unpacklo_ps(r2, r3);                                   \
+        const __m128 high0 = _mm_unpackhi_ps(r0, r1), high1 = _mm_unpackhi_ps(r2, r3);                                 \
+        DISTI_TURNED(i, 0, _mm_movelh_ps(low0, low1))                                                                  \
+        DISTI_TURNED(i, 1, _mm_movehl_ps(low1, low0))                                                                  \
+        DISTI_TURNED(i, 2, _mm_movelh_ps(high0, high1))                                                                \
+        DISTI_TURNED(i, 3, _mm_movehl_ps(high1, high0))                                                                \
+    }
 
 #define DISTI_FUNCTION DISTI_TARGET("sse2") DISTI_KERNEL static
 #define DISTI_VEC __m128
@@ -2553,6 +2622,8 @@ DISTI_FUNCTION __m128 disti_keep_sse2(__m128 v, int bits)
 #define DISTI_TALL(isa)
 #define DISTI_FEW(isa)
 #define DISTI_DEPTH 112
+#define DISTI_FLAT 1
+#define DISTI_FLAT_MORE(isa)
 DISTI_KERNELS(sse2, 4, 2)
 #define DISTI_ABS(v) _mm_andnot_ps(_mm_set1_ps(-0.0f), v)
 #define DISTI_BOUND_REST
@@ -2562,6 +2633,8 @@ DISTI_BOUND(sse2)
 #undef DISTI_VEC
 #undef DISTI_LANES
 #undef DISTI_DEPTH
+#undef DISTI_FLAT
+#undef DISTI_FLAT_MORE
 #undef DISTI_SET1
 #undef DISTI_LOAD
 #undef DISTI_STORE
@@ -2595,6 +2668,9 @@ DISTI_FUNCTION __m256 disti_keep_avx2(__m256 v, int bits)
     return _mm256_and_ps(v, _mm256_castsi256_ps(_mm256_cmpeq_epi32(both, lane)));
 }
 #define DISTI_DEPTH 176
+#define DISTI_FLAT 4
+#define DISTI_FLAT_MORE(isa) if (flat > 0 && g->columns > 1) disti_flat_four_##isa(g, flat);
+DISTI_FLAT_TILE(four_avx2, 4)
 DISTI_KERNELS(avx2, 4, 3)
 #define DISTI_ABS(v) _mm256_andnot_ps(_mm256_set1_ps(-0.0f), v)
 DISTI_BOUND(avx2)
@@ -2605,6 +2681,8 @@ DISTI_BOUND(avx2)
 #undef DISTI_VEC
 #undef DISTI_LANES
 #undef DISTI_DEPTH
+#undef DISTI_FLAT
+#undef DISTI_FLAT_MORE
 #undef DISTI_SET1
 #undef DISTI_LOAD
 #undef DISTI_STORE
@@ -2634,10 +2712,15 @@ DISTI_BOUND(avx2)
     { const __mmask16 m = DISTI_POSITIVE(v); memcpy((char *)(row) + (column) / 8, &m, sizeof m); }
 #define DISTI_KEEP(v, bits) _mm512_maskz_mov_ps((__mmask16)((bits) & 0xffff), v)
 #define DISTI_DEPTH 512
+#define DISTI_FLAT 8
+#define DISTI_FLAT_MORE(isa)                                                                                           \
+    if (flat > 0 && g->columns > 4) disti_flat_eight_##isa(g, flat);                                                   \
+    else if (flat > 0 && g->columns > 1) disti_flat_four_##isa(g, flat);
+DISTI_FLAT_TILE(four_avx512, 4)
+DISTI_FLAT_TILE(eight_avx512, 8)
 /* Eight sums are too few to hide the latency of a multiply-add. */
 #define DISTI_TALL(isa)                                                                                                \
-    for (; g->columns <= DISTI_LANES && first + 16 <= out; first += 16)                                                \
-        disti_gemm_tall_##isa(g, first, 0, from, to);
+    for (; g->columns <= DISTI_LANES && first + 16 <= out; first += 16) disti_gemm_tall_##isa(g, first, 0, from, to);
 DISTI_GEMM_TILE(tall_avx512, 16, 1, DISTI_SIDE)
 #define DISTI_FEW(isa)                                                                                                 \
     if (rows > 0 && rows <= 4 && g->columns > 2 * DISTI_LANES) {                                                       \
@@ -2838,8 +2921,10 @@ DISTI_HALF_KERNEL(bf16)
 #ifdef DISTI_NEON
 #if defined(__GNUC__) || defined(__clang__)
 #define DISTI_PREFETCH(p) __builtin_prefetch(p)
+#define DISTI_PREFETCH_FAR(p) __builtin_prefetch(p, 0, 2)
 #else
 #define DISTI_PREFETCH(p) __prefetch(p)
+#define DISTI_PREFETCH_FAR(p) __prefetch(p)
 #endif
 
 /* The factors of a tile come as lanes of two vectors instead of eight broadcasts. */
@@ -2877,6 +2962,8 @@ static float32x4_t disti_keep_neon(float32x4_t v, uint32_t bits)
 #define DISTI_TALL(isa)
 #define DISTI_FEW(isa)
 #define DISTI_DEPTH 112
+#define DISTI_FLAT 1
+#define DISTI_FLAT_MORE(isa)
 DISTI_KERNELS(neon, 8, 3)
 #define DISTI_BOUND_REST
 #define DISTI_ABS(v) vabsq_f32(v)
@@ -2953,6 +3040,7 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_FENCE
 #undef DISTI_UNROLLED
 #undef DISTI_AHEAD
+#undef DISTI_AFTER
 #undef DISTI_VECTORS
 #undef DISTI_STORE_RELU1
 #undef DISTI_STORE_POSITIVE1
@@ -2963,6 +3051,14 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_STORE_SUM
 #undef DISTI_STORE_RELU
 #undef DISTI_GEMM_TILE
+#undef DISTI_FLAT_SUM1
+#undef DISTI_FLAT_SUM
+#undef DISTI_FLAT_TILE
+#undef DISTI_TURN1
+#undef DISTI_TURN4
+#undef DISTI_TURN8
+#undef DISTI_TURNED
+#undef DISTI_TURN
 #undef DISTI_OFFSET
 #undef DISTI_ROW
 #undef DISTI_RETURN1
@@ -2988,6 +3084,7 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_BOUND_ZERO
 #undef DISTI_BOUND_STORE
 #undef DISTI_PREFETCH
+#undef DISTI_PREFETCH_FAR
 #undef DISTI_FUNCTION
 #undef DISTI_VEC
 #undef DISTI_LANES
@@ -3003,6 +3100,8 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_TALL
 #undef DISTI_FEW
 #undef DISTI_DEPTH
+#undef DISTI_FLAT
+#undef DISTI_FLAT_MORE
 #undef DISTI_MAC_LANE
 #undef DISTI_TABLE
 

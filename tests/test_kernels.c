@@ -10,9 +10,9 @@ typedef struct test_size {
     int rows, out, columns;
 } test_size;
 
-static const int test_columns[] = {1, 7, 8, 15, 16, 17, 31, 32, 33, 47, 48};
+static const int test_columns[] = {1, 2, 4, 5, 7, 8, 15, 16, 17, 31, 32, 33, 47, 48};
 
-enum { TEST_COLUMNS = 11, TEST_CASES = 70 * TEST_COLUMNS + 7, TEST_BLOCK = DISTI_BLOCK, TEST_LONGEST = 700 };
+enum { TEST_COLUMNS = 14, TEST_CASES = 70 * TEST_COLUMNS + 7, TEST_BLOCK = DISTI_BLOCK, TEST_LONGEST = 700 };
 
 /* All of 1..70 as rows and as outputs, each with all column counts, then inputs longer than a kernel takes at once. */
 static test_size test_case(int n)

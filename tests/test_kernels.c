@@ -191,7 +191,8 @@ static void check_back_case(const disti_kernels *kernels, test_random *random, t
             double sum = 0, size_sum = 0;
             for (int i = 0; i < terms; i++) {
                 const int o = g.alive_out ? out_list[i] : i;
-                const double term = (double)weights[packed(size.rows, size.out, o, k)] * (double)d_y[o * TEST_BLOCK + c];
+                const double term = (double)weights[packed(size.rows, size.out, o, k)] *
+                                    (double)d_y[o * TEST_BLOCK + c];
                 sum += term;
                 size_sum += fabs(term);
             }

@@ -1582,19 +1582,10 @@ DIST_API int dist_context_workers(const dist_context *ctx)
 /*@ 03 kernels ------------------------------------------------------------------------------------------------------ */
 
 /* Points stand in the lanes: activations of a block of DISTI_BLOCK points are rows [unit][DISTI_BLOCK], and a layer's
-   weights are packed in panels of DISTI_PANEL outputs, see disti_panel, so that one broadcast serves a whole row and an
-   input that is left out leaves out whole cache lines. Nothing is ever transposed on the way forward; the reverse pass
-   reads the same packing. */
-enum { DISTI_BLOCK = 48, DISTI_PANEL = 32 };
-
-/* Where output o's weight for input 0 stands; *stride is from one input to the next. A panel is (rows, stride): stride
-   is DISTI_PANEL, in the last panel what is left of `out` rounded up to a multiple of 8. */
-DISTI_INLINE size_t disti_panel(int rows, int out, int o, size_t *stride)
-{
-    const int first = o / DISTI_PANEL * DISTI_PANEL, left = (out + 7) / 8 * 8 - first;
-    *stride = (size_t)(unsigned)DISTI_MIN((int)DISTI_PANEL, left);
-    return (size_t)(unsigned)first * (size_t)(unsigned)rows + (size_t)(unsigned)(o - first);
-}
+   weights are packed in panels of eight outputs, element (o, k) at ((o / 8) * rows + k) * 8 + o % 8, so that one
+   broadcast serves a whole row. Nothing is ever transposed on the way forward; the reverse pass reads the same
+      packing. */
+enum { DISTI_BLOCK = 48 };
 
 /* forward   y[o][c] = bias[o] + sum_k weights(o, k) x[k][c]     k ascending over alive[0..alive_count-1], or all rows
              with relu or mask: y = max(0, y); bit c of mask[o] = y[o][c] > 0
@@ -1682,14 +1673,13 @@ static void disti_gemm_scalar(const disti_gemm *g)
 {
     const int count = g->alive ? g->alive_count : g->rows;
     for (int o = 0; o < (g->out + 7) / 8 * 8; o++) {
-        size_t stride;
-        const float *w = g->weights + disti_panel(g->rows, g->out, o, &stride);
+        const float *w = g->weights + (size_t)(o / 8) * (size_t)g->rows * 8 + o % 8;
         float *y = g->y + (size_t)o * DISTI_BLOCK;
         for (int c = 0; c < g->columns; c++) y[c] = g->bias[o];
         for (int i = 0; i < count; i++) {
             const size_t k = (size_t)(g->alive ? g->alive[i] : i);
             const float *x = g->x + k * DISTI_BLOCK;
-            for (int c = 0; c < g->columns; c++) y[c] += w[k * stride] * x[c];
+            for (int c = 0; c < g->columns; c++) y[c] += w[k * 8] * x[c];
         }
         uint64_t bits = 0;
         for (int c = 0; c < g->columns; c++) {
@@ -1711,10 +1701,9 @@ static void disti_gemm_back_scalar(const disti_gemm_back *g)
         float *d_x = g->d_x + k * DISTI_BLOCK;
         for (int c = 0; c < g->columns; c++) d_x[c] = 0.0f;
         for (int i = 0; i < out_count; i++) {
-            const int o = g->alive_out ? g->alive_out[i] : i;
-            size_t stride;
-            const float *weights = g->weights + disti_panel(g->rows, g->out, o, &stride);
-            const float w = weights[k * stride], *d_y = g->d_y + (size_t)o * DISTI_BLOCK;
+            const size_t o = (size_t)(g->alive_out ? g->alive_out[i] : i);
+            const float w = g->weights[(o / 8 * (size_t)g->rows + k) * 8 + o % 8];
+            const float *d_y = g->d_y + o * DISTI_BLOCK;
             for (int c = 0; c < g->columns; c++) d_x[c] += w * d_y[c];
         }
         if (!g->mask) continue;
@@ -2010,11 +1999,10 @@ static void disti_relu_scalar(size_t rows, float *y, uint64_t *mask)
 static void disti_bound_scalar(const disti_bound *g)
 {
     for (int o = 0; o < (g->out + 7) / 8 * 8; o++) {
-        size_t stride;
-        const float *w = g->weights + disti_panel(g->rows, g->out, o, &stride);
+        const float *w = g->weights + (size_t)(o / 8) * (size_t)g->rows * 8 + o % 8;
         float s[5] = {0, 0, 0, 0, 0};
         for (int i = 0; i < g->count; i++) {
-            const float v = w[(size_t)g->list[i] * stride], *m = g->model + (size_t)i * 8;
+            const float v = w[(size_t)g->list[i] * 8], *m = g->model + (size_t)i * 8;
             for (int j = 0; j < 4; j++) s[j] += v * m[j];
             s[4] += (v < 0.0f ? -v : v) * m[4];
         }
@@ -2128,7 +2116,6 @@ DISTI_PLAIN(scalar, static)
      DISTI_RELU(v) DISTI_POSITIVE(v)    max(v, 0), and the bits of the lanes that are greater than 0
      DISTI_BITS(row, column, v)         the latter into a mask's row, from this column on
      DISTI_KEEP(v, bits)                v with 0 where the lane's bit is 0
-     DISTI_FLAT, DISTI_FLAT_MORE(isa)   so many points at most go to DISTI_FLAT_TILEs, more than one to these
      DISTI_TALL(isa)                    tiles of one vector's columns, where there are registers for sixteen rows
      DISTI_FEW(isa)                     the reverse pass of up to four rows, where other tiles are higher
      DISTI_DEPTH                        rows that one pass takes: the columns of a tile in them, 128 bytes of a row
@@ -2158,6 +2145,7 @@ DISTI_PLAIN(scalar, static)
 #define DISTI_INPUT(i, j) const DISTI_VEC x##j = DISTI_LOAD(xs + j * DISTI_LANES);
 #define DISTI_MAC(i, j) DISTI_FMA(a##i##j, b, x##j);
 #define DISTI_SIDE(i, V) { const DISTI_VEC b = DISTI_SET1(ws[i]); DISTI_X##V(DISTI_MAC, i) }
+#define DISTI_ABOVE(i, V) { const DISTI_VEC b = DISTI_SET1(ws[(i) / 8 * panel + (i) % 8]); DISTI_X##V(DISTI_MAC, i) }
 #define DISTI_APART(i, V) { const DISTI_VEC b = DISTI_SET1(ws[k##i]); DISTI_X##V(DISTI_MAC, i) }
 #define DISTI_STEP(R, V, FACTORS, w, x) \
     { const float *const ws = w, *const xs = x; DISTI_X##V(DISTI_INPUT, 0) DISTI_Y##R(FACTORS, V) DISTI_FENCE }
@@ -2173,7 +2161,6 @@ DISTI_PLAIN(scalar, static)
 
 /* Prefetches reach beyond the end of an array, where a pointer may not go. */
 #define DISTI_AHEAD(p, floats) DISTI_PREFETCH((const char *)((uintptr_t)(p) + sizeof(float) * (size_t)(floats)))
-#define DISTI_AFTER(p, floats) DISTI_PREFETCH_FAR((const char *)((uintptr_t)(p) + sizeof(float) * (size_t)(floats)))
 #define DISTI_VECTORS(floats) (((floats) + DISTI_LANES - 1) / DISTI_LANES)
 
 #define DISTI_STORE_RELU1(i, j)                                                                                        \
@@ -2192,47 +2179,38 @@ DISTI_PLAIN(scalar, static)
 #define DISTI_STORE_POSITIVE(i, V) { const DISTI_VEC b = DISTI_SET1(bias[i]); DISTI_X##V(DISTI_STORE_POSITIVE1, i) }
 
 /* Takes inputs from..to-1 of the list or of all; between two passes over DISTI_DEPTH rows the sums wait in y.
-   Weights are fetched a panel early, into the second cache. Two tiles share a line: one fetches it for every other
-   input, one for the rest, which spreads what has to come from far away. */
+   Weights are fetched `ahead` floats early: a little, or a whole panel where passes cut the panels. */
 #define DISTI_GEMM_TILE(name, R, V, FACTORS)                                                                           \
-    DISTI_NOINLINE DISTI_FUNCTION void disti_gemm_##name(const disti_gemm *g, int o, int c, int from, int to)          \
+    DISTI_NOINLINE DISTI_FUNCTION void disti_gemm_##name(const disti_gemm *g, int o, int c, int from, int to,          \
+                                                          size_t ahead)                                                \
     {                                                                                                                  \
-        size_t stride;                                                                                                 \
-        const float *w = g->weights + disti_panel(g->rows, g->out, o, &stride);                                        \
+        const size_t panel = (size_t)g->rows * 8, at = (size_t)(unsigned)o;                                            \
+        const float *w = g->weights + at / 8 * panel + at % 8;                                                         \
         const float *x = g->x + c;                                                                                     \
         const float *bias = g->bias + o;                                                                               \
-        float *y = g->y + (size_t)(unsigned)o * DISTI_BLOCK + c;                                                       \
-        const size_t turn = (size_t)(unsigned)o / 8 % 2, ahead = (size_t)(unsigned)g->rows * DISTI_PANEL;              \
+        float *y = g->y + at * DISTI_BLOCK + c;                                                                        \
         DISTI_Y##R(DISTI_ZERO, V)                                                                                      \
         if (from > 0) {                                                                                                \
             DISTI_Y##R(DISTI_AGAIN, V)                                                                                 \
         }                                                                                                              \
         if (g->alive) {                                                                                                \
-            const int *alive = g->alive + from, *end = g->alive + to;                                                  \
-            for (; DISTI_UNROLLED && end - alive >= 2; alive += 2) {                                                   \
-                const size_t k = (size_t)(unsigned)alive[0], next = (size_t)(unsigned)alive[1];                        \
-                DISTI_AFTER(w + (size_t)(unsigned)alive[turn] * stride, ahead);                                        \
-                DISTI_STEP(R, V, FACTORS, w + k * stride, x + k * DISTI_BLOCK)                                         \
-                DISTI_STEP(R, V, FACTORS, w + next * stride, x + next * DISTI_BLOCK)                                   \
-            }                                                                                                          \
-            for (; alive < end; alive++) {                                                                             \
+            for (const int *alive = g->alive + from, *end = g->alive + to; alive < end; alive++) {                     \
                 const size_t k = (size_t)(unsigned)*alive;                                                             \
-                DISTI_AFTER(w + k * stride, ahead);                                                                    \
-                DISTI_STEP(R, V, FACTORS, w + k * stride, x + k * DISTI_BLOCK)                                         \
+                DISTI_AHEAD(w + k * 8, ahead);                                                                         \
+                if (R > 8) DISTI_AHEAD(w + panel + k * 8, ahead);                                                      \
+                DISTI_STEP(R, V, FACTORS, w + k * 8, x + k * DISTI_BLOCK)                                              \
             }                                                                                                          \
         } else {                                                                                                       \
-            const float *end = x + (size_t)(unsigned)to * DISTI_BLOCK;                                                 \
-            w += (size_t)(unsigned)from * stride;                                                                      \
+            const float *end = w + (size_t)(unsigned)to * 8;                                                           \
+            w += (size_t)(unsigned)from * 8;                                                                           \
             x += (size_t)(unsigned)from * DISTI_BLOCK;                                                                 \
-            for (; DISTI_UNROLLED && end - x >= 2 * DISTI_BLOCK; w += 2 * stride, x += 2 * DISTI_BLOCK) {              \
-                DISTI_AFTER(w, ahead + turn * stride);                                                                 \
+            for (; DISTI_UNROLLED && end - w >= 2 * 8; w += 2 * 8, x += 2 * DISTI_BLOCK) {                             \
+                DISTI_AHEAD(w, ahead);                                                                                 \
+                if (R > 8) DISTI_AHEAD(w + panel, ahead);                                                              \
                 DISTI_STEP(R, V, FACTORS, w, x)                                                                        \
-                DISTI_STEP(R, V, FACTORS, w + stride, x + DISTI_BLOCK)                                                 \
+                DISTI_STEP(R, V, FACTORS, w + 8, x + DISTI_BLOCK)                                                      \
             }                                                                                                          \
-            for (; x < end; w += stride, x += DISTI_BLOCK) {                                                           \
-                DISTI_AFTER(w, ahead);                                                                                 \
-                DISTI_STEP(R, V, FACTORS, w, x)                                                                        \
-            }                                                                                                          \
+            for (; w < end; w += 8, x += DISTI_BLOCK) DISTI_STEP(R, V, FACTORS, w, x)                                  \
         }                                                                                                              \
         if (to < (g->alive ? g->alive_count : g->rows)) {                                                              \
             DISTI_Y##R(DISTI_STORE_PART, V)                                                                            \
@@ -2246,56 +2224,12 @@ DISTI_PLAIN(scalar, static)
         }                                                                                                              \
     }
 
-/* At most R points: the lanes are outputs, the points stand in the factors, so that hardly a lane is idle. The sums are
-   those of the other tiles in the same order. Takes the first `out` outputs, a multiple of two vectors. */
-#define DISTI_FLAT_SUM1(i, j)                                                                                          \
-    a##i##j = DISTI_ADD(DISTI_ADD(a##i##j, DISTI_LOAD(g->bias + o + j * DISTI_LANES)), DISTI_SET1(0.0f));              \
-    DISTI_STORE(part + (2 * (i) + j) * DISTI_LANES, positive ? DISTI_RELU(a##i##j) : a##i##j);
-#define DISTI_FLAT_SUM(i, V) DISTI_X##V(DISTI_FLAT_SUM1, i)
-#define DISTI_TURN1(i, V)                                                                                              \
-    for (int j = 0; j < 4; j++) {                                                                                      \
-        y[j * DISTI_BLOCK] = part[n + j];                                                                              \
-        bits[j] = part[n + j] > 0.0f;                                                                                  \
-    }
-#define DISTI_TURN4(i, V) if ((i) % 4 == 0) DISTI_TURN(i, part + 2 * (i) * DISTI_LANES + n)
-#define DISTI_TURN8(i, V) DISTI_TURN4(i, V)
-#define DISTI_FLAT_TILE(name, R)                                                                                       \
-    DISTI_NOINLINE DISTI_FUNCTION void disti_flat_##name(const disti_gemm *g, int out)                                 \
-    {                                                                                                                  \
-        const int positive = g->mask || g->relu;                                                                       \
-        float part[2 * R * DISTI_LANES];                                                                               \
-        for (int o = 0; o < out; o += 2 * DISTI_LANES) {                                                               \
-            size_t stride;                                                                                             \
-            const float *w = g->weights + disti_panel(g->rows, g->out, o, &stride), *x = g->x;                         \
-            float *y = g->y + (size_t)(unsigned)o * DISTI_BLOCK;                                                       \
-            DISTI_Y##R(DISTI_ZERO, 2)                                                                                  \
-            if (g->alive) {                                                                                            \
-                for (const int *alive = g->alive, *end = alive + g->alive_count; alive < end; alive++) {               \
-                    const size_t k = (size_t)(unsigned)*alive;                                                         \
-                    const float *next = w + (size_t)(unsigned)(end - alive > 12 ? alive[12] : end[-1]) * stride;       \
-                    DISTI_AHEAD(next, 0);                                                                              \
-                    DISTI_AHEAD(next, 2 * DISTI_LANES - 1);                                                            \
-                    DISTI_STEP(R, 2, DISTI_SIDE, x + k * DISTI_BLOCK, w + k * stride)                                  \
-                }                                                                                                      \
-            } else {                                                                                                   \
-                for (int k = 0; k < g->rows; k++, x += DISTI_BLOCK, w += stride) DISTI_STEP(R, 2, DISTI_SIDE, x, w)    \
-            }                                                                                                          \
-            DISTI_Y##R(DISTI_FLAT_SUM, 2)                                                                              \
-            for (int n = 0; n < 2 * DISTI_LANES; n += 4, y += 4 * DISTI_BLOCK) {                                       \
-                unsigned bits[4] = {0, 0, 0, 0};                                                                       \
-                DISTI_Y##R(DISTI_TURN##R, 2)                                                                           \
-                for (int i = 0; i < 4 && g->mask; i++) g->mask[o + n + i] = bits[i];                                   \
-            }                                                                                                          \
-        }                                                                                                              \
-    }
-
 /* k: the rows of this tile; from `count` on they repeat the last one and are not stored. */
-#define DISTI_OFFSET(i, V) const size_t k##i = (size_t)(unsigned)k[i] * stride;
-#define DISTI_ROW(i) ((size_t)(unsigned)k[i] * DISTI_BLOCK)
-#define DISTI_RETURN1(i, j) a##i##j = DISTI_LOAD(d_x + DISTI_ROW(i) + j * DISTI_LANES);
+#define DISTI_OFFSET(i, V) const size_t k##i = (size_t)(unsigned)k[i] * 8;
+#define DISTI_RETURN1(i, j) a##i##j = DISTI_LOAD(d_x + k##i * (DISTI_BLOCK / 8) + j * DISTI_LANES);
 #define DISTI_RETURN(i, V) DISTI_X##V(DISTI_RETURN1, i)
 #define DISTI_STORE_KEEP1(i, j)                                                                                        \
-    DISTI_STORE(d_x + DISTI_ROW(i) + j * DISTI_LANES, DISTI_KEEP(a##i##j, bits >> (j * DISTI_LANES)));
+    DISTI_STORE(d_x + k##i * (DISTI_BLOCK / 8) + j * DISTI_LANES, DISTI_KEEP(a##i##j, bits >> (j * DISTI_LANES)));
 #define DISTI_STORE_KEEP(i, V)                                                                                         \
     if (i < count) {                                                                                                   \
         const uint64_t bits = g->mask ? g->mask[k[i]] >> c : ~(uint64_t)0;                                             \
@@ -2307,10 +2241,8 @@ DISTI_PLAIN(scalar, static)
                                                           int from, int to)                                            \
     {                                                                                                                  \
         const float *weights = g->weights, *d_y = g->d_y + c;                                                          \
-        const size_t panel = (size_t)(unsigned)g->rows * DISTI_PANEL;                                                  \
-        size_t stride;                                                                                                 \
-        disti_panel(g->rows, g->out, g->alive_out && to > from ? g->alive_out[from] : from, &stride);                  \
-        const float *next = weights + (size_t)(unsigned)k[R - 1] * stride + stride;                                    \
+        const size_t panel = (size_t)g->rows * 8;                                                                      \
+        const float *next = weights + (size_t)(unsigned)k[R - 1] * 8 + 8;                                              \
         float *d_x = g->d_x + c;                                                                                       \
         DISTI_Y##R(DISTI_OFFSET, V)                                                                                    \
         DISTI_Y##R(DISTI_ZERO, V)                                                                                      \
@@ -2319,21 +2251,20 @@ DISTI_PLAIN(scalar, static)
         }                                                                                                              \
         if (g->alive_out) {                                                                                            \
             for (const int *alive = g->alive_out + from, *end = g->alive_out + to; alive < end; alive++) {             \
-                const size_t o = (size_t)(unsigned)*alive, at = o / DISTI_PANEL * panel, column = o % DISTI_PANEL;     \
-                DISTI_AHEAD(next, at + column * 8);                                                                    \
-                DISTI_STEP(R, V, DISTI_APART, weights + at + column, d_y + o * DISTI_BLOCK)                            \
+                const size_t o = (size_t)(unsigned)*alive;                                                             \
+                DISTI_AHEAD(next, (o >> 3) * panel + (o & 7) * 8);                                                     \
+                DISTI_STEP(R, V, DISTI_APART, weights + (o >> 3) * panel + (o & 7), d_y + o * DISTI_BLOCK)             \
             }                                                                                                          \
         } else {                                                                                                       \
             size_t o = (size_t)(unsigned)from;                                                                         \
             const size_t end = (size_t)(unsigned)to;                                                                   \
-            const float *x = d_y + o * DISTI_BLOCK;                                                                    \
-            for (; DISTI_UNROLLED && o + 8 <= end; o += 8) {                                                           \
-                const size_t at = o / DISTI_PANEL * panel, column = o % DISTI_PANEL;                                   \
-                const float *w = weights + at + column;                                                                \
-                DISTI_AHEAD(next, at + column * 8);                                                                    \
-                DISTI_AHEAD(next, at + column * 8 + 16);                                                               \
-                DISTI_AHEAD(next, at + column * 8 + 32);                                                               \
-                DISTI_AHEAD(next, at + column * 8 + 48);                                                               \
+            const float *w = weights + (o >> 3) * panel, *x = d_y + o * DISTI_BLOCK;                                   \
+            next += (o >> 3) * panel;                                                                                  \
+            for (; DISTI_UNROLLED && o + 8 <= end; o += 8, w += panel - 8, next += panel) {                            \
+                DISTI_AHEAD(next, 0);                                                                                  \
+                DISTI_AHEAD(next, 16);                                                                                 \
+                DISTI_AHEAD(next, 32);                                                                                 \
+                DISTI_AHEAD(next, 48);                                                                                 \
                 for (int half = 0; half < 2; half++, w += 4, x += 4 * DISTI_BLOCK) {                                   \
                     DISTI_STEP(R, V, DISTI_APART, w, x)                                                                \
                     DISTI_STEP(R, V, DISTI_APART, w + 1, x + DISTI_BLOCK)                                              \
@@ -2342,8 +2273,7 @@ DISTI_PLAIN(scalar, static)
                 }                                                                                                      \
             }                                                                                                          \
             for (; o < end; o++)                                                                                       \
-                DISTI_STEP(R, V, DISTI_APART, weights + o / DISTI_PANEL * panel + o % DISTI_PANEL,                     \
-                           d_y + o * DISTI_BLOCK)                                                                      \
+                DISTI_STEP(R, V, DISTI_APART, weights + (o >> 3) * panel + (o & 7), d_y + o * DISTI_BLOCK)             \
         }                                                                                                              \
         DISTI_Y##R(DISTI_STORE_KEEP, V)                                                                                \
     }
@@ -2468,17 +2398,15 @@ DISTI_PLAIN(scalar, static)
     DISTI_FUNCTION void disti_gemm_##isa(const disti_gemm *g)                                                          \
     {                                                                                                                  \
         const int count = g->alive ? g->alive_count : g->rows, out = (g->out + 7) / 8 * 8;                             \
+        const size_t ahead = count > DISTI_DEPTH ? (size_t)g->rows * 8 : 256;                                          \
         if (g->mask) memset(g->mask, 0, (size_t)(unsigned)out * sizeof(uint64_t));                                     \
-        const int flat = g->columns <= DISTI_FLAT ? out / (2 * DISTI_LANES) * (2 * DISTI_LANES) : 0;                   \
         int to = 0;                                                                                                    \
-        if (flat > 0 && g->columns == 1) disti_flat_one_##isa(g, flat);                                                \
-        DISTI_FLAT_MORE(isa)                                                                                           \
         do {                                                                                                           \
             const int from = to;                                                                                       \
             to = DISTI_MIN(from + DISTI_DEPTH, count);                                                                 \
-            int first = flat;                                                                                          \
+            int first = 0;                                                                                             \
             DISTI_TALL(isa)                                                                                            \
-            DISTI_EACH(gemm, isa, first, out, g->columns, R, W, (g, n, c, from, to))                                   \
+            DISTI_EACH(gemm, isa, first, out, g->columns, R, W, (g, n, c, from, to, ahead))                            \
         } while (to < count);                                                                                          \
         if (!g->mask || g->columns == DISTI_BLOCK) return;                                                             \
         for (int o = 0; o < out; o++) g->mask[o] &= ((uint64_t)1 << g->columns) - 1;                                   \
@@ -2487,11 +2415,10 @@ DISTI_PLAIN(scalar, static)
     {                                                                                                                  \
         const int rows = g->alive_rows ? g->alive_rows_count : g->rows;                                                \
         const int count = g->alive_out ? g->alive_out_count : g->out;                                                  \
-        const int full = disti_back_full(g, count);                                                                    \
         int to = 0, k[8];                                                                                              \
         do {                                                                                                           \
             const int from = to;                                                                                       \
-            to = DISTI_MIN(from + DISTI_DEPTH, from < full ? full : count);                                            \
+            to = DISTI_MIN(from + DISTI_DEPTH, count);                                                                 \
             DISTI_FEW(isa)                                                                                             \
             DISTI_EACH(back, isa, 0, rows, g->columns, R, W,                                                           \
                        (g, disti_back_rows(g, rows, n, k), rows - n, c, from, to))                                     \
@@ -2515,24 +2442,26 @@ DISTI_PLAIN(scalar, static)
         }                                                                                                              \
     }
 
-/* Two vectors of outputs at a time, those from `first` to end - 1; their number is a multiple of a vector's. */
+/* Two vectors of outputs at a time: of two panels, or of one where a vector is half a panel. */
 #define DISTI_BOUND1(j)                                                                                                \
     { const DISTI_VEC b = DISTI_SET1(m[j]); DISTI_FMA(a0##j, b, v); DISTI_FMA(a1##j, b, w); }
 #define DISTI_BOUND_ZERO(j) DISTI_VEC a0##j = DISTI_SET1(0.0f), a1##j = DISTI_SET1(0.0f);
 #define DISTI_BOUND_STORE(j) DISTI_STORE(s + j * g->stride, a0##j); DISTI_STORE(t + j * g->stride, a1##j);
 #define DISTI_BOUND(isa)                                                                                               \
-    DISTI_NOINLINE DISTI_FUNCTION void disti_bounds_##isa(const disti_bound *g, int first, int end)                    \
+    DISTI_NOINLINE DISTI_FUNCTION void disti_bound_##isa(const disti_bound *g)                                         \
     {                                                                                                                  \
-        for (int o = first; o < end; o += 2 * DISTI_LANES) {                                                           \
-            const int other = o + DISTI_LANES < end ? DISTI_LANES : 0;                                                 \
-            size_t stride;                                                                                             \
-            const float *w0 = g->weights + disti_panel(g->rows, g->out, o, &stride), *w1 = w0 + other;                 \
+        const int panels = (g->out + 7) / 8;                                                                           \
+        const size_t panel = (size_t)g->rows * 8;                                                                      \
+        for (int p = 0; p < panels; p += DISTI_LANES / 4) {                                                            \
+            const size_t other = (size_t)(unsigned)(DISTI_LANES == 8 ? DISTI_MIN(p + 1, panels - 1) : p);              \
+            const size_t half = DISTI_LANES == 8 ? 0 : 4;                                                              \
+            const float *w0 = g->weights + (size_t)(unsigned)p * panel, *w1 = g->weights + other * panel + half;       \
             const float *m = g->model;                                                                                 \
-            float *s = g->sum + o, *t = s + other;                                                                     \
+            float *s = g->sum + (size_t)(unsigned)p * 8, *t = g->sum + other * 8 + half;                               \
             DISTI_BOUND_ZERO(0) DISTI_BOUND_ZERO(1) DISTI_BOUND_ZERO(2) DISTI_BOUND_ZERO(3) DISTI_BOUND_ZERO(4)        \
-            for (const int *k = g->list, *last = k + g->count; k < last; k++, m += 8) {                                \
-                DISTI_VEC v = DISTI_LOAD(w0 + (size_t)(unsigned)*k * stride);                                          \
-                DISTI_VEC w = DISTI_LOAD(w1 + (size_t)(unsigned)*k * stride);                                          \
+            for (const int *k = g->list, *end = k + g->count; k < end; k++, m += 8) {                                  \
+                DISTI_VEC v = DISTI_LOAD(w0 + (size_t)(unsigned)*k * 8);                                               \
+                DISTI_VEC w = DISTI_LOAD(w1 + (size_t)(unsigned)*k * 8);                                               \
                 DISTI_BOUND1(0) DISTI_BOUND1(1) DISTI_BOUND1(2) DISTI_BOUND1(3)                                        \
                 v = DISTI_ABS(v);                                                                                      \
                 w = DISTI_ABS(w);                                                                                      \
@@ -2540,19 +2469,12 @@ DISTI_PLAIN(scalar, static)
             }                                                                                                          \
             DISTI_BOUND_STORE(0) DISTI_BOUND_STORE(1) DISTI_BOUND_STORE(2) DISTI_BOUND_STORE(3) DISTI_BOUND_STORE(4)   \
         }                                                                                                              \
-    }                                                                                                                  \
-    DISTI_FUNCTION void disti_bound_##isa(const disti_bound *g)                                                        \
-    {                                                                                                                  \
-        const int out = (g->out + 7) / 8 * 8, whole = out / DISTI_LANES * DISTI_LANES;                                 \
-        disti_bounds_##isa(g, 0, whole);                                                                               \
-        DISTI_BOUND_REST                                                                                               \
     }
 
 #define DISTI_KERNELS(isa, R, W)                                                                                       \
     DISTI_GEMM_TILE(wide_##isa, R, W, DISTI_SIDE)                                                                      \
     DISTI_GEMM_TILE(middle_##isa, 8, 2, DISTI_SIDE)                                                                    \
     DISTI_GEMM_TILE(narrow_##isa, 8, 1, DISTI_SIDE)                                                                    \
-    DISTI_FLAT_TILE(one_##isa, 1)                                                                                      \
     DISTI_BACK_TILE(wide_##isa, R, W)                                                                                  \
     DISTI_BACK_TILE(middle_##isa, 8, 2)                                                                                \
     DISTI_BACK_TILE(narrow_##isa, 8, 1)                                                                                \
@@ -2563,15 +2485,6 @@ DISTI_PLAIN(scalar, static)
     DISTI_RELU_ROWS(isa)                                                                                               \
     DISTI_PLAIN(isa, DISTI_LOOPS DISTI_FUNCTION)                                                                       \
     DISTI_DRIVERS(isa, R, W)
-
-/* How many of the `count` outputs stand in full panels: a pass ends there, since the last one's stride is its own. */
-static int disti_back_full(const disti_gemm_back *g, int count)
-{
-    const int end = g->out / DISTI_PANEL * DISTI_PANEL;
-    if ((g->out + 7) / 8 * 8 <= DISTI_MAX(end, (int)DISTI_PANEL)) return count;
-    while (count > 0 && (g->alive_out ? g->alive_out[count - 1] : count - 1) >= end) count--;
-    return count;
-}
 
 /* The eight rows of d_x that begin at the list's entry n; beyond its end the last one again. */
 static const int *disti_back_rows(const disti_gemm_back *g, int rows, int n, int *k)
@@ -2585,22 +2498,6 @@ static const int *disti_back_rows(const disti_gemm_back *g, int rows, int n, int
 
 #ifdef DISTI_X86
 #define DISTI_PREFETCH(p) _mm_prefetch(p, _MM_HINT_T0)
-#define DISTI_PREFETCH_FAR(p) _mm_prefetch(p, _MM_HINT_T1)
-/* Four points from i on of four outputs, the points two vectors apart, to four rows and their bits. */
-#define DISTI_TURNED(i, j, v)                                                                                          \
-    _mm_storeu_ps(y + (i) + (j) * DISTI_BLOCK, v);                                                                     \
-    bits[j] |= (unsigned)_mm_movemask_ps(_mm_cmpgt_ps(v, _mm_setzero_ps())) << (i);
-#define DISTI_TURN(i, from)                                                                                            \
-    {                                                                                                                  \
-        const __m128 r0 = _mm_loadu_ps(from), r1 = _mm_loadu_ps(from + 2 * DISTI_LANES);                               \
-        const __m128 r2 = _mm_loadu_ps(from + 4 * DISTI_LANES), r3 = _mm_loadu_ps(from + 6 * DISTI_LANES);             \
-        const __m128 low0 = _mm_unpacklo_ps(r0, r1), low1 = _mm_unpacklo_ps(r2, r3);                                   \
-        const __m128 high0 = _mm_unpackhi_ps(r0, r1), high1 = _mm_unpackhi_ps(r2, r3);                                 \
-        DISTI_TURNED(i, 0, _mm_movelh_ps(low0, low1))                                                                  \
-        DISTI_TURNED(i, 1, _mm_movehl_ps(low1, low0))                                                                  \
-        DISTI_TURNED(i, 2, _mm_movelh_ps(high0, high1))                                                                \
-        DISTI_TURNED(i, 3, _mm_movehl_ps(high1, high0))                                                                \
-    }
 
 #define DISTI_FUNCTION DISTI_TARGET("sse2") DISTI_KERNEL static
 #define DISTI_VEC __m128
@@ -2622,19 +2519,14 @@ DISTI_FUNCTION __m128 disti_keep_sse2(__m128 v, int bits)
 #define DISTI_TALL(isa)
 #define DISTI_FEW(isa)
 #define DISTI_DEPTH 112
-#define DISTI_FLAT 1
-#define DISTI_FLAT_MORE(isa)
 DISTI_KERNELS(sse2, 4, 2)
 #define DISTI_ABS(v) _mm_andnot_ps(_mm_set1_ps(-0.0f), v)
-#define DISTI_BOUND_REST
 DISTI_BOUND(sse2)
 #undef DISTI_ABS
 #undef DISTI_FUNCTION
 #undef DISTI_VEC
 #undef DISTI_LANES
 #undef DISTI_DEPTH
-#undef DISTI_FLAT
-#undef DISTI_FLAT_MORE
 #undef DISTI_SET1
 #undef DISTI_LOAD
 #undef DISTI_STORE
@@ -2668,9 +2560,6 @@ DISTI_FUNCTION __m256 disti_keep_avx2(__m256 v, int bits)
     return _mm256_and_ps(v, _mm256_castsi256_ps(_mm256_cmpeq_epi32(both, lane)));
 }
 #define DISTI_DEPTH 176
-#define DISTI_FLAT 4
-#define DISTI_FLAT_MORE(isa) if (flat > 0 && g->columns > 1) disti_flat_four_##isa(g, flat);
-DISTI_FLAT_TILE(four_avx2, 4)
 DISTI_KERNELS(avx2, 4, 3)
 #define DISTI_ABS(v) _mm256_andnot_ps(_mm256_set1_ps(-0.0f), v)
 DISTI_BOUND(avx2)
@@ -2681,8 +2570,6 @@ DISTI_BOUND(avx2)
 #undef DISTI_VEC
 #undef DISTI_LANES
 #undef DISTI_DEPTH
-#undef DISTI_FLAT
-#undef DISTI_FLAT_MORE
 #undef DISTI_SET1
 #undef DISTI_LOAD
 #undef DISTI_STORE
@@ -2712,16 +2599,11 @@ DISTI_BOUND(avx2)
     { const __mmask16 m = DISTI_POSITIVE(v); memcpy((char *)(row) + (column) / 8, &m, sizeof m); }
 #define DISTI_KEEP(v, bits) _mm512_maskz_mov_ps((__mmask16)((bits) & 0xffff), v)
 #define DISTI_DEPTH 512
-#define DISTI_FLAT 8
-#define DISTI_FLAT_MORE(isa)                                                                                           \
-    if (flat > 0 && g->columns > 4) disti_flat_eight_##isa(g, flat);                                                   \
-    else if (flat > 0 && g->columns > 1) disti_flat_four_##isa(g, flat);
-DISTI_FLAT_TILE(four_avx512, 4)
-DISTI_FLAT_TILE(eight_avx512, 8)
 /* Eight sums are too few to hide the latency of a multiply-add. */
 #define DISTI_TALL(isa)                                                                                                \
-    for (; g->columns <= DISTI_LANES && first + 16 <= out; first += 16) disti_gemm_tall_##isa(g, first, 0, from, to);
-DISTI_GEMM_TILE(tall_avx512, 16, 1, DISTI_SIDE)
+    for (; g->columns <= DISTI_LANES && first + 16 <= out; first += 16)                                                \
+        disti_gemm_tall_##isa(g, first, 0, from, to, ahead);
+DISTI_GEMM_TILE(tall_avx512, 16, 1, DISTI_ABOVE)
 #define DISTI_FEW(isa)                                                                                                 \
     if (rows > 0 && rows <= 4 && g->columns > 2 * DISTI_LANES) {                                                       \
         disti_back_few_##isa(g, disti_back_rows(g, rows, 0, k), rows, 0, from, to);                                    \
@@ -2729,12 +2611,6 @@ DISTI_GEMM_TILE(tall_avx512, 16, 1, DISTI_SIDE)
     }
 DISTI_BACK_TILE(few_avx512, 4, 3)
 DISTI_KERNELS(avx512, 8, 3)
-#define DISTI_ABS(v) _mm512_castsi512_ps(_mm512_and_si512(_mm512_castps_si512(v), _mm512_set1_epi32(0x7fffffff)))
-#undef DISTI_BOUND_REST
-#define DISTI_BOUND_REST disti_bounds_avx2(g, whole, out);
-DISTI_BOUND(avx512)
-#undef DISTI_ABS
-#undef DISTI_BOUND_REST
 #undef DISTI_TALL
 #undef DISTI_FEW
 
@@ -2749,7 +2625,7 @@ DISTI_BOUND(avx512)
    Steps of y that are not zero everywhere are appended to y_alive. bad: a sum was not finite. */
 typedef struct disti_half {
     const float *weights;    /* panels (out / 8, steps, 8) of 32 bits */
-    const float *point_weights, *bias; /* point_weights: panels in f32, the last `point` inputs are used */
+    const float *point_weights, *bias; /* point_weights: of the first panel, (point, 8) */
     const float *points[2];  /* (point, B) of the first and second 48 columns */
     const float *x;          /* (steps, B) of 32 bits */
     const int *alive;        /* NULL: all steps */
@@ -2758,7 +2634,8 @@ typedef struct disti_half {
     int *y_alive;
     void (*activate)(int activation, float scale, size_t n, float *y, float *slope); /* NULL: ReLU */
     float scale;
-    int activation, steps, alive_count, panel_rows, point, out, columns, y_alive_count, bad;
+    size_t panel;            /* floats from one panel of point_weights to the next */
+    int activation, steps, alive_count, point, out, columns, y_alive_count, bad;
 } disti_half;
 
 #define DISTI_CELL(c) ((c) / DISTI_BLOCK)
@@ -2769,17 +2646,15 @@ typedef struct disti_half {
         float sums[8 * DISTI_COLUMNS];                                                                                 \
         const size_t n = DISTI_WIDEN * V * 16, at = (size_t)(unsigned)o;                                               \
         const int *alive = g->alive, *const alive_end = alive ? alive + g->alive_count : NULL;                         \
-        size_t stride;                                                                                                 \
-        const float *factors = g->point_weights + disti_panel(g->panel_rows, g->out, o, &stride);                      \
+        const float *factors = g->point_weights + at / 8 * g->panel;                                                   \
         const float *const weights = g->weights + at * (size_t)(unsigned)g->steps;                                     \
-        factors += (size_t)(unsigned)(g->panel_rows - g->point) * stride;                                              \
         for (size_t i = 0; i < 8; i++) {                                                                               \
             for (size_t c = 0; c < n; c += 16) {                                                                       \
                 const float *p = g->points[DISTI_CELL(c)] + c % DISTI_BLOCK;                                           \
                 __m512 sum = _mm512_set1_ps(g->bias[at + i]);                                                          \
                 for (size_t j = 0; j < (size_t)(unsigned)g->point; j++)                                                \
-                    sum = _mm512_fmadd_ps(_mm512_set1_ps(factors[j * stride + i]),                                     \
-                                          _mm512_loadu_ps(p + j * DISTI_BLOCK), sum);                                  \
+                    sum = _mm512_fmadd_ps(_mm512_set1_ps(factors[j * 8 + i]), _mm512_loadu_ps(p + j * DISTI_BLOCK),    \
+                                          sum);                                                                        \
                 _mm512_storeu_ps(sums + i * DISTI_COLUMNS + c, sum);                                                   \
             }                                                                                                          \
         }                                                                                                              \
@@ -2921,10 +2796,8 @@ DISTI_HALF_KERNEL(bf16)
 #ifdef DISTI_NEON
 #if defined(__GNUC__) || defined(__clang__)
 #define DISTI_PREFETCH(p) __builtin_prefetch(p)
-#define DISTI_PREFETCH_FAR(p) __builtin_prefetch(p, 0, 2)
 #else
 #define DISTI_PREFETCH(p) __prefetch(p)
-#define DISTI_PREFETCH_FAR(p) __prefetch(p)
 #endif
 
 /* The factors of a tile come as lanes of two vectors instead of eight broadcasts. */
@@ -2962,10 +2835,7 @@ static float32x4_t disti_keep_neon(float32x4_t v, uint32_t bits)
 #define DISTI_TALL(isa)
 #define DISTI_FEW(isa)
 #define DISTI_DEPTH 112
-#define DISTI_FLAT 1
-#define DISTI_FLAT_MORE(isa)
 DISTI_KERNELS(neon, 8, 3)
-#define DISTI_BOUND_REST
 #define DISTI_ABS(v) vabsq_f32(v)
 DISTI_BOUND(neon)
 #undef DISTI_ABS
@@ -2987,7 +2857,6 @@ static uint32_t disti_f16_bits(float x) /* not called: dist_net_set_half refuses
 
 #define DISTI_TABLE(isa) \
     kernels.gemm = disti_gemm_##isa; \
-    kernels.bound = disti_bound_##isa; \
     kernels.gemm_back = disti_gemm_back_##isa; \
     kernels.gemm_weights = disti_gemm_weights_##isa; \
     kernels.dot = disti_dot_##isa; \
@@ -3008,13 +2877,16 @@ static disti_kernels disti_kernels_for(int isa)
 {
     disti_kernels kernels;
     DISTI_TABLE(scalar)
+    kernels.bound = disti_bound_scalar;
 #ifdef DISTI_X86
     if (isa == DIST_ISA_SSE2) { DISTI_TABLE(sse2) }
     if (isa == DIST_ISA_AVX2) { DISTI_TABLE(avx2) }
     if (isa == DIST_ISA_AVX512) { DISTI_TABLE(avx512) }
+    if (isa == DIST_ISA_SSE2) kernels.bound = disti_bound_sse2;
+    if (isa == DIST_ISA_AVX2 || isa == DIST_ISA_AVX512) kernels.bound = disti_bound_avx2;
 #endif
 #ifdef DISTI_NEON
-    if (isa == DIST_ISA_NEON) { DISTI_TABLE(neon) }
+    if (isa == DIST_ISA_NEON) { DISTI_TABLE(neon) kernels.bound = disti_bound_neon; }
 #endif
     (void)isa;
     return kernels;
@@ -3036,11 +2908,11 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_MAC
 #undef DISTI_SIDE
 #undef DISTI_APART
+#undef DISTI_ABOVE
 #undef DISTI_STEP
 #undef DISTI_FENCE
 #undef DISTI_UNROLLED
 #undef DISTI_AHEAD
-#undef DISTI_AFTER
 #undef DISTI_VECTORS
 #undef DISTI_STORE_RELU1
 #undef DISTI_STORE_POSITIVE1
@@ -3051,16 +2923,7 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_STORE_SUM
 #undef DISTI_STORE_RELU
 #undef DISTI_GEMM_TILE
-#undef DISTI_FLAT_SUM1
-#undef DISTI_FLAT_SUM
-#undef DISTI_FLAT_TILE
-#undef DISTI_TURN1
-#undef DISTI_TURN4
-#undef DISTI_TURN8
-#undef DISTI_TURNED
-#undef DISTI_TURN
 #undef DISTI_OFFSET
-#undef DISTI_ROW
 #undef DISTI_RETURN1
 #undef DISTI_RETURN
 #undef DISTI_STORE_KEEP1
@@ -3084,7 +2947,6 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_BOUND_ZERO
 #undef DISTI_BOUND_STORE
 #undef DISTI_PREFETCH
-#undef DISTI_PREFETCH_FAR
 #undef DISTI_FUNCTION
 #undef DISTI_VEC
 #undef DISTI_LANES
@@ -3100,8 +2962,6 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_TALL
 #undef DISTI_FEW
 #undef DISTI_DEPTH
-#undef DISTI_FLAT
-#undef DISTI_FLAT_MORE
 #undef DISTI_MAC_LANE
 #undef DISTI_TABLE
 
@@ -6308,25 +6168,25 @@ static void disti_group_pack(const dist_shape *shape, disti_group *g, int l, int
 {
     const dist_net *net = shape->net;
     const disti_linear *layer = &net->layer[l];
+    size_t panel = (size_t)(layer->prev + layer->point) * 8;
     for (int o = 0; o < out; o += 8) {
         const float *from[8];
-        size_t stride[8], to;
-        float *row = g->panels + disti_panel(g->count, out, o, &to);
+        float *row = g->panels + (size_t)o * (size_t)g->count;
         for (int i = 0; i < 8; i++) {
-            int u = unit[DISTI_MIN(o + i, out - 1)];
-            from[i] = net->panels + layer->panel + disti_panel(layer->prev + layer->point, layer->out, u, &stride[i]);
-            g->bias[o + i] = shape->bias[(size_t)l * (size_t)net->max_rows + (size_t)u];
+            size_t u = (size_t)unit[DISTI_MIN(o + i, out - 1)];
+            from[i] = net->panels + layer->panel + u / 8 * panel + u % 8;
+            g->bias[o + i] = shape->bias[(size_t)l * (size_t)net->max_rows + u];
         }
-        for (int j = 0; j < g->count; j++, row += to) {
-            const size_t k = (size_t)g->list[j];
-            row[0] = from[0][k * stride[0]];
-            row[1] = from[1][k * stride[1]];
-            row[2] = from[2][k * stride[2]];
-            row[3] = from[3][k * stride[3]];
-            row[4] = from[4][k * stride[4]];
-            row[5] = from[5][k * stride[5]];
-            row[6] = from[6][k * stride[6]];
-            row[7] = from[7][k * stride[7]];
+        for (int j = 0; j < g->count; j++, row += 8) {
+            const size_t k = (size_t)g->list[j] * 8;
+            row[0] = from[0][k];
+            row[1] = from[1][k];
+            row[2] = from[2][k];
+            row[3] = from[3][k];
+            row[4] = from[4][k];
+            row[5] = from[5][k];
+            row[6] = from[6][k];
+            row[7] = from[7][k];
         }
     }
 }
@@ -6484,11 +6344,12 @@ static void disti_half_hidden(const dist_shape *shape, const disti_kernels *kern
 {
     const dist_net *net = shape->net;
     const disti_linear *layer = &net->layer[l];
+    size_t rows = (size_t)(layer->prev + layer->point);
     int last = l + 2 == net->layers, pairs = net->half == DIST_HALF_BF16;
     h->steps = pairs ? (layer->prev + 1) / 2 : layer->prev;
     h->weights = net->half_panels + layer->half_panel;
-    h->point_weights = net->panels + layer->panel;
-    h->panel_rows = layer->prev + layer->point;
+    h->point_weights = net->panels + layer->panel + (size_t)layer->prev * 8;
+    h->panel = rows * 8;
     h->point = layer->point;
     h->bias = shape->bias + (size_t)l * (size_t)net->max_rows;
     h->x = b->act[l & 1];
@@ -7285,10 +7146,10 @@ static float disti_half_largest(const dist_net *net)
     float largest = 0.0f;
     for (int l = 1; l + 1 < net->layers; l++) {
         const disti_linear *layer = &net->layer[l];
-        for (int o = 0; o < layer->out; o++) {
-            size_t stride, at = disti_panel(layer->prev + layer->point, layer->out, o, &stride);
-            for (size_t k = 0; k < (size_t)layer->prev; k++)
-                largest = DISTI_MAX(largest, fabsf(net->panels[layer->panel + at + k * stride]));
+        size_t rows = (size_t)(layer->prev + layer->point), count = disti_round_up((size_t)layer->out, 8) * rows;
+        for (size_t i = 0; i < count; i++) {
+            float w = net->panels[layer->panel + i];
+            if (i / 8 % rows < (size_t)layer->prev) largest = DISTI_MAX(largest, w < 0.0f ? -w : w);
         }
     }
     return largest;
@@ -7300,20 +7161,18 @@ static void disti_half_pack(dist_net *net)
     size_t offset = 0;
     for (int l = 0; l + 1 < net->layers; l++) {
         disti_linear *layer = &net->layer[l];
-        size_t steps = disti_half_steps(layer, net->half);
+        size_t rows = (size_t)(layer->prev + layer->point), steps = disti_half_steps(layer, net->half);
         layer->half_panel = offset;
         offset += disti_half_size(layer, net->half);
         for (size_t o = 0; o < (size_t)layer->out; o += 8) {
-            size_t stride;
-            const float *w = net->panels + layer->panel +
-                             disti_panel(layer->prev + layer->point, layer->out, (int)o, &stride);
             for (size_t at = 0; at < steps * 8; at++) {
+                const float *w = net->panels + layer->panel + o * rows;
                 uint32_t bits[2] = {0, 0};
                 if (net->half == DIST_HALF_F16) {
-                    bits[0] = bits[1] = disti_f16_bits(w[at / 8 * stride + at % 8]);
+                    bits[0] = bits[1] = disti_f16_bits(w[at]);
                 } else {
                     for (size_t i = 0; i < 2 && 2 * (at / 8) + i < (size_t)layer->prev; i++) {
-                        memcpy(&bits[i], w + (2 * (at / 8) + i) * stride + at % 8, sizeof *bits);
+                        memcpy(&bits[i], w + (2 * (at / 8) + i) * 8 + at % 8, sizeof *bits);
                         bits[i] = (bits[i] + 0x7fff + (bits[i] >> 16 & 1)) >> 16;
                     }
                 }
@@ -7334,11 +7193,10 @@ static void disti_net_pack(dist_net *net)
         int last = l + 1 == net->layers;
         for (size_t o = 0; o < (size_t)layer->out; o++) {
             const float *w = net->params + layer->weight + o * (size_t)layer->in;
-            size_t stride, first = disti_panel((int)rows, layer->out, (int)o, &stride);
             for (size_t k = 0; k < rows; k++) {
                 size_t column = k < (size_t)layer->prev ? (size_t)layer->x_column + k
                                                         : (size_t)layer->point_column + k - (size_t)layer->prev;
-                size_t at = last ? o * rows + k : first + k * stride;
+                size_t at = last ? o * rows + k : (o / 8 * rows + k) * 8 + o % 8;
                 net->panels[layer->panel + at] = layer->scale * w[column];
             }
         }

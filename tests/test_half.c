@@ -47,8 +47,7 @@ static double reference(const dist_shape *shape, const float *p, double *bound)
         for (int o = 0; o < (last ? net->sdf_channel + 1 : layer->out); o++) {
             double sum = (double)shape->bias[(size_t)l * (size_t)net->max_rows + (size_t)o], error = 0.0;
             for (int k = 0; k < count; k++) {
-                size_t stride, first = disti_panel(count, layer->out, o, &stride);
-                size_t panel = last ? (size_t)(o * count + k) : first + (size_t)k * stride;
+                size_t panel = last ? (size_t)(o * count + k) : (size_t)((o / 8 * count + k) * 8 + o % 8);
                 double w = (double)net->panels[layer->panel + panel];
                 double v = k < layer->prev ? x[at][k] : (double)rows[(k - layer->prev) * DISTI_BLOCK];
                 double known = k < layer->prev ? e[at][k] : 0.0;

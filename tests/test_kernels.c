@@ -74,16 +74,14 @@ static int random_list(test_random *random, int n, int *list)
     return count;
 }
 
+static size_t packed(int rows, int o, int k)
+{
+    return ((size_t)(o / 8) * (size_t)rows + (size_t)k) * 8 + (size_t)(o % 8);
+}
+
 static int rounded(int out)
 {
     return (out + 7) / 8 * 8;
-}
-
-/* Panels of 32 outputs, the last one as wide as it must be: each a matrix of (rows, width). */
-static size_t packed(int rows, int out, int o, int k)
-{
-    const int first = o - o % 32, width = rounded(out) - first < 32 ? rounded(out) - first : 32;
-    return (size_t)(first * rows + k * width + o - first);
 }
 
 /* The panels of all outputs; padded outputs have weight zero. */
@@ -93,7 +91,7 @@ static float *panels(test_random *random, int rows, int out)
     float *w = floats(n);
     memset(w, 0, n * sizeof(float));
     for (int o = 0; o < out; o++)
-        for (int k = 0; k < rows; k++) w[packed(rows, out, o, k)] = test_random_float(random, -1.0f, 1.0f);
+        for (int k = 0; k < rows; k++) w[packed(rows, o, k)] = test_random_float(random, -1.0f, 1.0f);
     return w;
 }
 
@@ -133,7 +131,7 @@ static void check_gemm_case(const disti_kernels *kernels, test_random *random, t
             double sum = (double)bias[o], size_sum = fabs(sum);
             for (int i = 0; i < terms; i++) {
                 const int k = with_list ? list[i] : i;
-                const double term = (double)weights[packed(size.rows, size.out, o, k)] * (double)x[k * TEST_BLOCK + c];
+                const double term = (double)weights[packed(size.rows, o, k)] * (double)x[k * TEST_BLOCK + c];
                 sum += term;
                 size_sum += fabs(term);
             }
@@ -191,8 +189,7 @@ static void check_back_case(const disti_kernels *kernels, test_random *random, t
             double sum = 0, size_sum = 0;
             for (int i = 0; i < terms; i++) {
                 const int o = g.alive_out ? out_list[i] : i;
-                const double term = (double)weights[packed(size.rows, size.out, o, k)] *
-                                    (double)d_y[o * TEST_BLOCK + c];
+                const double term = (double)weights[packed(size.rows, o, k)] * (double)d_y[o * TEST_BLOCK + c];
                 sum += term;
                 size_sum += fabs(term);
             }

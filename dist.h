@@ -8408,18 +8408,13 @@ static int disti_ray_step(const disti_tracer *tracer, disti_ray *ray)
     float stretch = !ray->known ? tracer->how.step_scale : DISTI_MAX(1.0f, 1.8f / (1.0f - DISTI_MIN(slope, 0.75f)));
     float step = radius * DISTI_MIN(stretch, 8.0f);
     int mode = DISTI_MARCH;
-    int beyond = ray->fb < 0.0f; /* what is wanted is the gap before the crossing: no jump after it */
-    if (ray->known && slope < -0.05f && ray->f < 0.05f * tracer->field->radius && !beyond) {
+    if (ray->known && slope < -0.05f && ray->f < 0.05f * tracer->field->radius) {
         float jump = ray->f / -ray->slope, cap = 3.0f * radius + epsilon;
         step = 1.03f * jump + 0.5f * epsilon;
         if (step > cap) { /* short of the end: f must still be positive there, or something came in between */
             if (ray->f < 5e-3f * tracer->field->radius) cap = DISTI_MAX(cap, 1e-2f * tracer->field->radius);
             step = DISTI_MIN(0.97f * jump, cap);
         }
-        mode = DISTI_JUMP;
-    } else if (ray->known && slope < 0.2f && ray->f < 1e-2f * tracer->field->radius && step < 4.0f * radius &&
-               !beyond && !tracer->how.certified) {
-        step = 4.0f * radius; /* along a surface; where f is not what the slope says it is taken back */
         mode = DISTI_JUMP;
     }
     if (ray->known && slope > -0.3f) { /* but not through a surface that the slope foretells */
@@ -8429,9 +8424,8 @@ static int disti_ray_step(const disti_tracer *tracer, disti_ray *ray)
     }
     float q = ray->s + step;
     float spacing = ray->s + 2.4e-7f * tracer->field->radius;
-    float behind = ray->fb < 0.0f ? -ray->fb : ray->fb, clear = ray->b - disti_empty(tracer, behind);
-    if (behind > 0.0f && ray->b > ray->s && q > clear) { /* into the gap before the sample beyond, not past it */
-        q = 0.5f * (ray->s + radius + clear);
+    if (ray->fb > 0.0f && ray->b > ray->s && q > ray->b) { /* into the gap before the sample beyond, not past it */
+        q = 0.5f * (ray->s + radius + ray->b - disti_empty(tracer, ray->fb));
         mode = DISTI_MARCH;
     }
     q = DISTI_MAX(q, spacing);
@@ -8703,10 +8697,6 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
                 ray->b = q;
                 ray->fb = f;
             }
-            float beyond = disti_empty(tracer, ray->fb < 0.0f ? -ray->fb : ray->fb);
-            float middle = 0.5f * (radius + ray->b - ray->s - beyond); /* of the gap, or as far as the slope allows */
-            float wide = 1.8f * radius / (1.0f - DISTI_MIN(ray->slope / tracer->lipschitz, 0.75f));
-            if (!tracer->how.certified) radius = DISTI_MAX(radius, DISTI_MIN(middle, wide));
             return disti_ray_ask(ray, DISTI_MARCH, DISTI_MIN(ray->s + DISTI_MAX(radius, spacing), ray->leave));
         }
         if (ray->fb < 0.0f) { /* a crossing lies before b: is there room for another before it? */
@@ -9900,32 +9890,29 @@ static float disti_pixel_width(const disti_tracer *tracer, const disti_tile *til
     return (float)(sqrt(disti_dot(c, c)) / DISTI_MAX(fabs(tile->view->fx), fabs(tile->view->fy)));
 }
 
+/* Cones for the parts of a tile's blocks between lattice pixels that are not all hits: the outline passes there, and
+   rays that only come near take many queries. For rays that have not set out. */
+static void disti_outline(const disti_tracer *tracer, int worker, const disti_tile *tile, disti_bench *bench)
+{
+    disti_cone *cones = (disti_cone *)(void *)bench->rest;
+    int first = bench->cones;
+    size_t active = 0;
+    for (int i = 0; i < first; i++) {
+        int open = 0;
+        for (int k = 0; k < 4 && cones[i].state == DISTI_CONE_BLOCKED && cones[i].size == DISTI_LATTICE; k++) {
+            int x = cones[i].x + (k & 1 ? DISTI_LATTICE : 0), y = cones[i].y + (k & 2 ? DISTI_LATTICE : 0);
+            open |= x < tile->width && y < tile->height && bench->rays[y * tile->width + x].status != DIST_RAY_HIT;
+        }
+        if (open) disti_cone_split(tracer, tile, bench, &cones[i], &bench->cones, &active);
+    }
+    disti_cone_rounds(tracer, worker, tile, bench, &bench->cones, active, DISTI_CONE_OUTLINE);
+    for (int i = first; i < bench->cones; i++)
+        if (cones[i].state != DISTI_CONE_SPLIT) disti_cone_finish(tracer, tile, bench, &cones[i]);
+}
+
 /* So few rays left march on beside the next pass's, instead of in nearly empty blocks of points: somewhat more queries,
    as nothing is foretold from them then, in less time. */
 enum { DISTI_LATER = 6 };
-
-/* Cones for the quarters of a tile's blocks of `size` pixels whose corners, pixels traced by now, are not all hits: the
-   outline passes there, and rays that only come near take many queries. For rays that have not set out; `active` others
-   wait in bench->index. */
-static void disti_outline(const disti_tracer *tracer, int worker, const disti_tile *tile, disti_bench *bench, int size,
-                          size_t active)
-{
-    disti_cone *cones = (disti_cone *)(void *)bench->rest;
-    int first = bench->cones, later[DISTI_LATER];
-    size_t marching = 0;
-    memcpy(later, bench->index, active * sizeof(int));
-    for (int i = 0; i < first; i++) {
-        int open = 0;
-        for (int k = 0; k < 4 && cones[i].state == DISTI_CONE_BLOCKED && cones[i].size == size; k++) {
-            int x = cones[i].x + (k & 1 ? size : 0), y = cones[i].y + (k & 2 ? size : 0);
-            open |= x < tile->width && y < tile->height && bench->rays[y * tile->width + x].status != DIST_RAY_HIT;
-        }
-        if (open) disti_cone_split(tracer, tile, bench, &cones[i], &bench->cones, &marching);
-    }
-    disti_cone_rounds(tracer, worker, tile, bench, &bench->cones, marching, size / 2);
-    for (int i = first; i < bench->cones; i++) disti_cone_finish(tracer, tile, bench, &cones[i]);
-    memcpy(bench->index, later, active * sizeof(int));
-}
 
 static void disti_lattice_balls(const disti_tracer *tracer, const disti_tile *tile, disti_bench *bench)
 {
@@ -9945,6 +9932,7 @@ static void disti_lattice_balls(const disti_tracer *tracer, const disti_tile *ti
 static void disti_trace_lattice(const disti_tracer *tracer, int worker, const disti_tile *tile, disti_bench *bench)
 {
     size_t active = 0;
+    int later[DISTI_LATER];
     if (!tile->cheap) disti_lattice_balls(tracer, tile, bench);
     for (int i = 0, y = 0; y < tile->height; y++) {
         for (int x = 0; x < tile->width; x++, i++) {
@@ -9956,10 +9944,13 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
         }
     }
     active = disti_trace_rounds(tracer, worker, bench, active, DISTI_LATER);
-    if (bench->cones > 0) disti_outline(tracer, worker, tile, bench, DISTI_LATTICE, active);
-    size_t behind = (size_t)DISTI_CONES_MOST * sizeof(disti_cone); /* the cones, which keep their place */
-    DIST_ASSERT(behind + 6 * DISTI_TILE_RAYS * sizeof(float) <= DISTI_REST_BYTES);
-    if (tile->cheap && tile->normals) bench->gradient = (float *)(void *)(bench->rest + behind);
+    if (bench->cones > 0) {
+        memcpy(later, bench->index, active * sizeof(int));
+        disti_outline(tracer, worker, tile, bench);
+        memcpy(bench->index, later, active * sizeof(int));
+    }
+    DIST_ASSERT(6 * DISTI_TILE_RAYS * sizeof(float) <= DISTI_REST_BYTES);
+    if (tile->cheap && tile->normals) bench->gradient = (float *)(void *)bench->rest; /* the cones are done with */
     for (int h = DISTI_LATTICE / 2; h > 0; h /= 2) {
         if (bench->balls) bench->balls->stride = h;
         if (bench->balls) bench->balls->window = DISTI_MIN(h + 3, 6);
@@ -9974,8 +9965,6 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
             }
             active = disti_trace_rounds(tracer, worker, bench, active, h > 1 || pass == 1 ? DISTI_LATER : 0);
         }
-        if (bench->cones > 0 && h > DISTI_CONE_OUTLINE)
-            disti_outline(tracer, worker, tile, bench, h, active);
     }
     bench->balls = NULL;
 }

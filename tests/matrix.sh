@@ -93,8 +93,8 @@ if [ -n "$quick" ]; then
     cc=cc
     have gcc && cc=gcc
     if can $cc $sanitize; then
-        # test_gradients takes minutes there; the backward pass is in others, random scenes among them.
-        set -- $(basename -s .c tests/test_*.c | grep -v gradients)
+        # test_gradients takes minutes there; the backward pass is in others, random scenes among them. test_needs counts.
+        set -- $(basename -s .c tests/test_*.c | grep -v -e gradients -e needs)
         row sanitizers build/matrix/sanitizers $cc "$sanitize" "" 1 "" "$@"
     else
         skip_row sanitizers "$cc has no sanitizers here"

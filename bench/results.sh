@@ -93,7 +93,7 @@ if [ -n "$quick" ]; then
     shown="embedded_5_64"
 else
     rm -f build/work_precision/*.svg
-    csv work_precision build/bench_work_precision --largest 1024 --sweep 128 --minutes 0.5 --svg build/work_precision/q
+    csv work_precision build/bench_work_precision --largest 1024 --sweep 128 --minutes 0.35 --svg build/work_precision/q
     table_size=128
     cp build/work_precision/q_losses.svg "$folder/work_precision_losses.svg" || exit 1
     shown="torus_grazing_128 rods_1e-3_128 embedded_5_128 mug_128"

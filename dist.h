@@ -1352,10 +1352,10 @@ static dist_status disti_enter(const dist_context *ctx)
     return ctx->workers > 0 ? DIST_OK : ctx->status;
 }
 
-/* n to the next multiple of `to`, a power of two; small sizes: cannot overflow. */
+/* n to the next multiple of `to`, a power of two; SIZE_MAX, the mark of what does not fit, where there is none. */
 static size_t disti_round_up(size_t n, size_t to)
 {
-    return (n + to - 1) & ~(to - 1);
+    return n > (size_t)-1 - to ? (size_t)-1 : (n + to - 1) & ~(to - 1);
 }
 
 /* Makes each worker's lane at least `bytes`. The contents do not survive: create functions only. */

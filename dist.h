@@ -9274,14 +9274,15 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
    nearer. */
 typedef struct disti_foot {
     float p[3], x[3];
-    float best[3], normal[3]; /* nearest surface point so far, grad f there at unit length */
+    float best[3], normal[3]; /* nearest surface point so far, grad f there at unit length; before there is one: the
+                                 last samples outside and inside */
     float distance;  /* from p to it, 3e38: none yet; of a miss: the least there can be */
     float least;     /* no surface is nearer to p than this */
     float radius;    /* p is a sphere's center; 3e38: none */
     float away;      /* of p from the bounding sphere; 0: within */
     float f, damping, share;
     float sign;
-    unsigned char status, steps;
+    unsigned char status, steps, sides; /* sides: 1 a sample was outside, 2 inside */
 } disti_foot;
 
 enum { DISTI_FEET = 512, DISTI_FOOT_STEPS = 96 };
@@ -9309,12 +9310,12 @@ static int disti_foot_arrive(const dist_field *field, disti_foot *foot, const fl
     float d[3], r = field->radius, reach = field->clamp > 0.0f ? 0.5f * field->clamp : 2.0f * r;
     for (int i = 0; i < 3; i++) d[i] = foot->p[i] - foot->x[i];
     float distance = disti_foot_length(d), gain = foot->distance - distance;
-    foot->status = DIST_RAY_HIT;
-    if (gain > 0.0f) {
+    if (gain > 0.0f || foot->status != DIST_RAY_HIT) {
         memcpy(foot->best, foot->x, sizeof foot->best);
         memcpy(foot->normal, n, sizeof foot->normal);
         foot->distance = distance;
     }
+    foot->status = DIST_RAY_HIT;
     if (gain < 1e-5f * r) foot->share *= 0.5f;
     if (foot->share < 0.02f || foot->distance <= foot->least * 1.00002f + 2e-6f * r) return 0;
     float share = DISTI_MIN(foot->share, reach / foot->distance);
@@ -9354,6 +9355,19 @@ static int disti_foot_advance(const dist_field *field, disti_foot *foot, float f
     }
     if (size <= 2e-6f * field->radius * DISTI_MAX(slope, 0.25f)) return disti_foot_arrive(field, foot, n);
     if (foot->steps >= DISTI_FOOT_STEPS) return 0;
+    if (foot->status != DIST_RAY_HIT) {
+        memcpy(f > 0.0f ? foot->best : foot->normal, foot->x, sizeof foot->x);
+        foot->sides |= (unsigned char)(f > 0.0f ? 1 : 2);
+        if (foot->sides >= 2 && foot->steps >= DISTI_FOOT_STEPS / 2) { /* to and fro in a thin solid: bisect */
+            if (foot->sides == 2) {
+                memcpy(foot->best, foot->x, sizeof foot->x);
+                disti_foot_move(field, foot->best, n, 2.0f * field->radius);
+                foot->sides = 3;
+            }
+            for (int i = 0; i < 3; i++) foot->x[i] = 0.5f * (foot->best[i] + foot->normal[i]);
+            return 1;
+        }
+    }
     if (f * foot->f < 0.0f && size > 0.5f * (foot->f < 0.0f ? -foot->f : foot->f)) foot->damping *= 0.5f;
     foot->f = f;
     disti_foot_move(field, foot->x, n, -foot->damping * f / DISTI_MAX(slope, 0.5f * lipschitz));
@@ -9436,7 +9450,8 @@ static dist_status disti_foot_run(disti_foot_job *job, const char *function, con
     if (status == DIST_OK) status = disti_field_check(job->ctx, job->field, function);
     if (status != DIST_OK) return status;
     if (job->n > 0 && (!job->points || !out))
-        return disti_fail(job->ctx, DIST_BAD_ARGUMENT, "%s: what is asked or what is answered is NULL", function, 0, 0);
+        return disti_fail(job->ctx, DIST_BAD_ARGUMENT, "%s: points, spheres or the array for the answers is NULL",
+                          function, 0, 0);
     if (job->n >> 20 >> 19 > 0)
         return disti_fail(job->ctx, DIST_BAD_ARGUMENT, "%s: n is %d, must be below 2^39", function, (double)job->n, 0);
     disti_run(job->ctx, (int)((job->n + DISTI_FEET - 1) / DISTI_FEET), disti_foot_task, job);

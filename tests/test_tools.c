@@ -339,6 +339,31 @@ TEST(closest_points_of_networks_lie_on_their_surface)
     dist_context_destroy(ctx);
 }
 
+/* Boards thinner than a step of Newton: the walk goes to and fro in them until it bisects. */
+TEST(closest_points_of_thin_boards_are_found)
+{
+    static float sdf[RAYS];
+    dist_context *ctx = test_context();
+    dist_net *net = dist_net_load_file(ctx, "examples/model.safetensors");
+    test_random random = test_random_seed(47);
+    for (int k = 0; k < 256; k += 37) {
+        dist_shape *shape = dist_shape_create(ctx, net, dist_net_code(net, k));
+        dist_field field = dist_shape_field(shape);
+        const size_t n = RAYS < 100 ? RAYS : 100;
+        make_points(&random, 3, 1.3f);
+        points[0] = points[2] = 0.0f, points[1] = 2.0f;
+        CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &field, n, points, closest, distance, status), ctx);
+        CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &field, n, closest, sdf, NULL), ctx);
+        for (size_t i = 0; i < n; i++) {
+            CHECK_EQUAL(DIST_RAY_HIT, status[i]);
+            CHECK_NEAR(0, sdf[i], 1e-5);
+        }
+        dist_shape_destroy(shape);
+    }
+    dist_net_destroy(net);
+    dist_context_destroy(ctx);
+}
+
 /* ---- contacts ---------------------------------------------------------------------------------------------------- */
 
 TEST(contacts_have_the_depth_and_the_normal_of_the_shape)
@@ -514,6 +539,7 @@ int main(int argc, char **argv)
     RUN(closest_points_of_distances_are_exact);
     RUN(closest_points_of_other_fields_are_on_the_surface_and_near);
     RUN(closest_points_of_networks_lie_on_their_surface);
+    RUN(closest_points_of_thin_boards_are_found);
     RUN(contacts_have_the_depth_and_the_normal_of_the_shape);
     RUN(spheres_that_are_clear_cost_one_query_or_none);
     RUN(spheres_touch_the_instance_that_is_there);

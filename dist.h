@@ -237,7 +237,7 @@ DIST_API dist_field dist_field_sphere(const float center_radius[4]);
 DIST_API dist_field dist_field_torus(const float center_radii[5]); /* x y z, ring radius, tube radius */
 DIST_API dist_field dist_field_box(const float center_half[6]);    /* x y z, half extents */
 
-/* Values and, unless NULL, gradients of any field at n points. */
+/* Values and, unless NULL, gradients of any field at n points; at one that is not finite they may be any number. */
 DIST_API dist_status dist_field_eval(dist_context *ctx, const dist_field *field, size_t n,
                                      const float *points /* (n,3) */, float *sdf /* (n) */,
                                      float *gradient /* (n,3) or NULL */);
@@ -263,7 +263,7 @@ typedef struct dist_gradients {
 /* Adjoint of dist_field_eval: with L = sum_i d_sdf[i] f(points[i]), adds dL/dcode and dL/dweights to grads and
    d_sdf[i] * grad f(points[i]) to d_points (n, 3) unless NULL.
    d_sdf (n): the weights, in; with seed_fn it is filled from it instead: then value and adjoint cost one pass together.
-   What grads holds of camera and color must be NULL. */
+   grads is not NULL, even for d_points alone; what it holds of camera and color must be NULL. */
 DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *field, size_t n, const float *points,
                                          float *d_sdf, dist_seed_fn seed_fn, void *seed_user, float *d_points,
                                          const dist_gradients *grads);
@@ -412,6 +412,8 @@ DIST_API dist_status dist_net_set_code(dist_context *ctx, dist_net *net, int ind
 /* code (dist_net_code_size) is copied; NULL means zeros. The net is borrowed until the shape is destroyed. */
 DIST_API dist_shape *dist_shape_create(dist_context *ctx, const dist_net *net, const float *code);
 DIST_API void dist_shape_destroy(dist_shape *shape);
+/* Fields and scenes of the shape have the new code at once. Their Lipschitz figures and coarse_error stay those that
+   dist_shape_create sampled: make a new shape where code or weights have come far. */
 DIST_API dist_status dist_shape_set_code(dist_shape *shape, const float *code);
 /* Color by a second net: rgb = g(code, color code, point), where g's code is the shape's followed by the color's; so
    dist_net_code_size(texture) is at least the shape's, and the rest is field.color_code_size. color_code is copied;
@@ -431,7 +433,7 @@ DIST_API dist_status dist_shape_eval(dist_context *ctx, dist_shape *shape, size_
 /* Pinhole camera. A world point x is seen at x_cam = rotation x + translation (row-major, x right, y down, z forward),
    pixel u = fx X/Z + skew Y/Z + cx, v = fy Y/Z + cy. */
 typedef struct dist_camera {
-    float fx, fy, cx, cy, skew; /* pixels */
+    float fx, fy, cx, cy, skew; /* pixels; fx and fy not 0, below 0: mirrored */
     float rotation[9]; /* rows off orthonormal by up to 1e-3 are made exact, more is refused: dist_camera_move by 0
                           projects */
     float translation[3];
@@ -440,10 +442,10 @@ typedef struct dist_camera {
 } dist_camera;
 
 /* fx = fy = height / 2 / tan(fov_y / 2), cx = (width - 1) / 2, cy = (height - 1) / 2, pixel centers at integers.
-   Degenerate input (eye = at, up along the view) is repaired by choosing another up; what cannot be repaired is
-   refused by the function that takes the camera. */
-DIST_API dist_camera dist_camera_look_at(int width, int height, float fov_y /* radians */, const float eye[3],
-                                         const float at[3], const float up[3]);
+   Degenerate input (eye = at, up along the view) is repaired by choosing another up; what cannot be repaired, such as
+   fov_y in degrees, makes fx 0, which the function that takes the camera refuses. */
+DIST_API dist_camera dist_camera_look_at(int width, int height, float fov_y /* radians, above 0, below pi */,
+                                         const float eye[3], const float at[3], const float up[3]);
 /* camera_to_world: row-major 3 x 4 or the upper part of 4 x 4, x right, y up, z backward (OpenGL, Blender, NeRF). */
 DIST_API void dist_camera_set_opengl(dist_camera *camera, const float camera_to_world[12]);
 DIST_API void dist_camera_get_opengl(const dist_camera *camera, float camera_to_world[12]);
@@ -540,14 +542,15 @@ typedef struct dist_stats {
 
 /* One free ray's result. Distances are along the unit direction. */
 typedef struct dist_hit {
-    float distance; /* of the hit, or of the sample of smallest |f| */
+    float distance; /* of the hit, or of the sample of smallest |f|; a ray without one: nearest to the center */
     float error;    /* bound on the distance's error, as good as f's slopes are sampled; no neighbors are asked */
-    float sdf;      /* f there */
+    float sdf;      /* f there; 3e38: no sample */
     int status;     /* DIST_RAY_* */
 } dist_hit;
 
 /* Traces n rays (origins (n, 3), directions (n, 3) of any nonzero length) with the guarded tracer: picking, shadows,
-   visibility. The first surface in front of each origin; with how.any_hit any of them. */
+   visibility. The first surface in front of each origin; with how.any_hit any of them. A ray that is 0 or not finite
+   is DIST_RAY_NOT_FINITE. */
 DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size_t n, const float *origins,
                                 const float *directions, const dist_render_desc *how, dist_hit *hits,
                                 dist_stats *stats);
@@ -568,15 +571,15 @@ typedef struct dist_contact {
     int status;      /* DIST_RAY_HIT: they touch; DIST_RAY_MISS; else as dist_field_closest_point */
 } dist_contact;
 
-/* n spheres (n, 4), center and radius, against the field. A sphere that is clear of it costs one query, or none where
-   it is clear of the bounding sphere. */
+/* n spheres (n, 4), center and radius (0 or more), against the field. A sphere that is clear of it costs one query, or
+   none where it is clear of the bounding sphere. */
 DIST_API dist_status dist_field_collide(dist_context *ctx, const dist_field *field, size_t n, const float *spheres,
                                         dist_contact *contacts);
 
 /* ---- 08 render --------------------------------------------------------------------------------------------------- */
 
 /* Planes of width * height entries, top row first; NULL: not computed. As d_out of dist_render_backward the float
-   planes hold dL/d(plane) and are only read. */
+   planes hold dL/d(plane) and are only read. Planes, how.pixels among them, must not overlap: that is not checked. */
 typedef struct dist_images {
     float *depth;          /* z in camera space; how.background where the ray is neither a hit nor UNRESOLVED */
     float *distance;       /* along the ray; likewise */
@@ -616,7 +619,8 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
 #ifndef DIST_NO_BACKWARD
 /* Adjoint of the dist_render that filled the tape: reads d_out's depth, distance, normal, silhouette, color; adds to
    grads; with how.relax_band color also at misses: outlines move, though not those that lie before another surface.
-   d_out->stats, if given, gets capped, backward_points and skipped added. No allocator call. */
+   What is not finite in d_out counts as 0. d_out->stats, if given, gets capped, backward_points and skipped added. No
+   allocator call. */
 DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *tape, const dist_images *d_out,
                                           const dist_gradients *grads);
 #endif
@@ -624,7 +628,7 @@ DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *ta
 /* ---- 09 loss ----------------------------------------------------------------------------------------------------- */
 
 /* Each returns weight * loss and adds its gradient to the d_ array unless that is NULL. n: pixels. Means are over the
-   pixels that count; none: 0 and no gradient. Sums are kept in double.
+   pixels that count; none, or a plane that is NULL: 0 and no gradient. Sums are kept in double.
    A target counts where it is finite and 0 < target < 1e5; mask may be NULL: then every pixel is a hit. */
 
 /* mean |depth - target| over hit, observed pixels */
@@ -681,13 +685,13 @@ DIST_API float dist_loss_photometric(const dist_photo *to, const dist_photo *fro
 typedef struct dist_adam {
     float *moments;
     float rate;    /* 0: 1e-2; negative: exactly no movement */
-    float beta1;   /* 0: 0.9 */
-    float beta2;   /* 0: 0.999 */
+    float beta1;   /* 0, or not below 1: 0.9 */
+    float beta2;   /* likewise: 0.999 */
     float epsilon; /* 0: 1e-8 */
     int step;      /* steps taken so far */
 } dist_adam;
 /* x (n) moves against gradient (n). A gradient that is not finite leaves its number and moments as they were;
-   returns how many did: n, all of them, where x, gradient or adam->moments is NULL. */
+   returns how many did: n, all of them, where x, gradient or adam->moments is NULL or the rate is not finite. */
 DIST_API size_t dist_adam_step(dist_adam *adam, size_t n, float *x, const float *gradient);
 #endif
 
@@ -1121,6 +1125,13 @@ typedef struct disti_limit {
     char name[24];
     double value, low, high;
 } disti_limit;
+
+/* More points or rays than any memory holds: a -1 turned size_t, most likely. */
+static dist_status disti_count_check(dist_context *ctx, size_t n, const char *function)
+{
+    if (n >> 20 >> 19 == 0 && n <= (size_t)-1 / (3 * sizeof(float))) return DIST_OK; /* 32 bits have no >> 39 */
+    return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: n is %d, more than memory can hold", function, (double)n, 0);
+}
 
 /* Refuses the first that is out of its range or not finite. */
 static dist_status disti_limits(dist_context *ctx, const char *function, size_t count, const disti_limit *limits)
@@ -3257,6 +3268,7 @@ DIST_API dist_status dist_field_eval(dist_context *ctx, const dist_field *field,
 {
     dist_status status = disti_enter(ctx);
     if (status == DIST_OK) status = disti_field_check(ctx, field, "dist_field_eval");
+    if (status == DIST_OK) status = disti_count_check(ctx, n, "dist_field_eval");
     if (status != DIST_OK || n == 0) return status;
     if (!points || !sdf) return disti_refuse(ctx, "dist_field_eval: %s is NULL", points ? "sdf" : "points");
     disti_field_eval_all(ctx, field, n, points, sdf, gradient);
@@ -3308,6 +3320,7 @@ DIST_API dist_status dist_color_eval(dist_context *ctx, const dist_field *field,
 {
     dist_status status = disti_enter(ctx);
     if (status == DIST_OK) status = disti_color_check(ctx, field, 0, "dist_color_eval");
+    if (status == DIST_OK) status = disti_count_check(ctx, n, "dist_color_eval");
     if (status != DIST_OK || n == 0) return status;
     if (!points || !color) return disti_refuse(ctx, "dist_color_eval: %s is NULL", points ? "color" : "points");
     disti_color_job job = {field, disti_cut(n, 8 * DISTI_BLOCK, 1u << 20), points, NULL, color, NULL, NULL, 0, 0};
@@ -3522,6 +3535,7 @@ DIST_API dist_status dist_color_backward(dist_context *ctx, const dist_field *fi
     dist_gradients mine;
     dist_status status = disti_enter(ctx);
     if (status == DIST_OK) status = disti_color_check(ctx, field, 1, name);
+    if (status == DIST_OK) status = disti_count_check(ctx, n, name);
     if (status == DIST_OK && !grads) status = disti_refuse(ctx, "%s: grads is NULL", name);
     if (status != DIST_OK) return status;
     if (disti_gradients_camera(grads))
@@ -3569,6 +3583,7 @@ DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *fi
     const char *name = "dist_field_backward";
     dist_status status = disti_enter(ctx);
     if (status == DIST_OK) status = disti_field_check(ctx, field, name);
+    if (status == DIST_OK) status = disti_count_check(ctx, n, name);
     if (status == DIST_OK) status = disti_gradients_plain(ctx, field, grads, name);
     if (status != DIST_OK || n == 0) return status;
     if (!points) return disti_refuse(ctx, "%s: points is NULL", name);
@@ -3596,6 +3611,7 @@ DIST_API dist_status dist_field_eikonal(dist_context *ctx, const dist_field *fie
     dist_status status = disti_enter(ctx);
     if (loss) *loss = 0.0f;
     if (status == DIST_OK) status = disti_field_check(ctx, field, name);
+    if (status == DIST_OK) status = disti_count_check(ctx, n, name);
     if (status == DIST_OK && grads) status = disti_gradients_plain(ctx, field, grads, name);
     if (status != DIST_OK || n == 0) return status;
     if (!points) return disti_refuse(ctx, "%s: points is NULL", name);
@@ -4327,6 +4343,8 @@ DIST_API dist_status dist_scene_find(dist_scene *scene, size_t n, const float *p
     if (!scene) return DIST_BAD_ARGUMENT;
     if (n == 0) return DIST_OK;
     if (!points || !index) return disti_refuse(scene->ctx, "dist_scene_find: %s is NULL", points ? "index" : "points");
+    dist_status status = disti_count_check(scene->ctx, n, "dist_scene_find");
+    if (status != DIST_OK) return status;
     disti_scene_job job = {scene, disti_cut(n, DISTI_SCENE_CHUNK, 1u << 20), points, index};
     disti_run(scene->ctx, job.pieces.count, disti_scene_find_task, &job);
     return DIST_OK;
@@ -7034,7 +7052,8 @@ DIST_API dist_status dist_shape_eval(dist_context *ctx, dist_shape *shape, size_
     if (!shape || !points || !channels)
         return disti_refuse(ctx, "dist_shape_eval: shape, points or channels is NULL", NULL);
     if (shape->ctx != ctx) return disti_refuse(ctx, "dist_shape_eval: shape belongs to another context", NULL);
-    if (n == 0) return DIST_OK;
+    status = disti_count_check(ctx, n, "dist_shape_eval");
+    if (status != DIST_OK || n == 0) return status;
     disti_channels_job job = {shape, disti_cut(n, 8 * DISTI_BLOCK, 1u << 20), points, channels};
     disti_run(ctx, job.pieces.count, disti_channels_task, &job);
     return DIST_OK;
@@ -7969,11 +7988,12 @@ DIST_API dist_camera dist_camera_look_at(int width, int height, float fov_y, con
     memset(&camera, 0, sizeof camera);
     camera.width = width;
     camera.height = height;
-    camera.fx = camera.fy = (float)(height / 2.0 / tan((double)fov_y / 2.0));
+    if (fov_y > 0.0f && fov_y < 3.14159265f) /* else 0, as below: refused by whoever takes the camera */
+        camera.fx = camera.fy = (float)(height / 2.0 / tan((double)fov_y / 2.0));
     camera.cx = (float)((width - 1) / 2.0);
     camera.cy = (float)((height - 1) / 2.0);
     if ((eye && !disti_finite_all(3, eye)) || (at && !disti_finite_all(3, at)) || (up && !disti_finite_all(3, up)))
-        camera.fx = 0.0f; /* refused by whoever takes the camera */
+        camera.fx = 0.0f;
     for (int i = 0; i < 3; i++) {
         center[i] = eye ? (double)eye[i] : 0.0;
         m[6 + i] = (at ? (double)at[i] : 0.0) - center[i];
@@ -9253,14 +9273,13 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
     disti_tracer tracer;
     dist_status status = disti_enter(ctx);
     if (status == DIST_OK) status = disti_field_check(ctx, field, "dist_trace");
+    if (status == DIST_OK) status = disti_count_check(ctx, n, "dist_trace");
     if (status == DIST_OK) status = disti_tracer_init(&tracer, ctx, field, how, "dist_trace");
     if (status != DIST_OK) return status;
     if (n > 0 && (!origins || !directions || !hits))
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_trace: origins, directions or hits is NULL", NULL, 0, 0);
     if (tracer.how.pixels)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_trace: how.pixels is for pictures, must be NULL", NULL, 0, 0);
-    if (n >> 20 >> 20 > 0) /* a size_t of 32 bits cannot be shifted by 40 */
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_trace: n is %d, must be below 2^40", NULL, (double)n, 0);
     disti_stats_begin(ctx);
     disti_free_job job = {&tracer, n, origins, directions, hits};
     disti_run(ctx, (int)((n + DISTI_FREE_RAYS - 1) / DISTI_FREE_RAYS), disti_free_task, &job);
@@ -9448,12 +9467,11 @@ static dist_status disti_foot_run(disti_foot_job *job, const char *function, con
 {
     dist_status status = disti_enter(job->ctx);
     if (status == DIST_OK) status = disti_field_check(job->ctx, job->field, function);
+    if (status == DIST_OK) status = disti_count_check(job->ctx, job->n, function);
     if (status != DIST_OK) return status;
     if (job->n > 0 && (!job->points || !out))
         return disti_fail(job->ctx, DIST_BAD_ARGUMENT, "%s: points, spheres or the array for the answers is NULL",
                           function, 0, 0);
-    if (job->n >> 20 >> 19 > 0)
-        return disti_fail(job->ctx, DIST_BAD_ARGUMENT, "%s: n is %d, must be below 2^39", function, (double)job->n, 0);
     disti_run(job->ctx, (int)((job->n + DISTI_FEET - 1) / DISTI_FEET), disti_foot_task, job);
     return DIST_OK;
 }
@@ -12799,7 +12817,7 @@ DIST_API float dist_loss_photometric(const dist_photo *to, const dist_photo *fro
 DIST_API size_t dist_adam_step(dist_adam *adam, size_t n, float *x, const float *gradient)
 {
     size_t skipped = 0;
-    if (!adam || !adam->moments || !x || !gradient) return n;
+    if (!adam || !adam->moments || !x || !gradient || !disti_finite(adam->rate)) return n;
     double rate = adam->rate < 0.0f ? 0.0 : (adam->rate > 0.0f ? (double)adam->rate : 1e-2);
     double beta1 = adam->beta1 > 0.0f && adam->beta1 < 1.0f ? (double)adam->beta1 : 0.9;
     double beta2 = adam->beta2 > 0.0f && adam->beta2 < 1.0f ? (double)adam->beta2 : 0.999;

@@ -228,6 +228,21 @@ TEST(adam_with_zero_gradients_never_moves)
     CHECK_NEAR(-2, x[1], 0);
 }
 
+TEST(adam_with_a_rate_that_is_not_finite_never_moves)
+{
+    float x[2] = {1, -2}, g[2] = {1, 1}, moments[4] = {0, 0, 0, 0};
+    dist_adam adam;
+    memset(&adam, 0, sizeof adam);
+    adam.moments = moments;
+    for (int k = 0; k < 2; k++) {
+        adam.rate = loss_bits(k ? 0x7f800000u : 0x7fc00000u);
+        CHECK_EQUAL(2, dist_adam_step(&adam, 2, x, g));
+        CHECK_EQUAL(0, adam.step);
+    }
+    CHECK_NEAR(1, x[0], 0);
+    CHECK_NEAR(0, moments[0], 0);
+}
+
 TEST(adam_stays_finite_for_huge_and_tiny_gradients)
 {
     float x[4] = {1, 1, 1, 1}, g[4] = {1e30f, -3.4e38f, 1e-30f, -1e-38f}, moments[8] = {0, 0, 0, 0, 0, 0, 0, 0};
@@ -302,6 +317,7 @@ int main(int argc, char **argv)
     RUN(a_million_small_terms_are_summed_without_loss);
     RUN(adam_is_its_formula_for_a_hundred_steps);
     RUN(adam_with_zero_gradients_never_moves);
+    RUN(adam_with_a_rate_that_is_not_finite_never_moves);
     RUN(adam_stays_finite_for_huge_and_tiny_gradients);
     RUN(adam_skips_and_counts_gradients_that_are_not_finite);
     RUN(adam_without_its_arrays_says_that_nothing_moved);

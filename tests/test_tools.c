@@ -485,6 +485,38 @@ TEST(what_has_no_answer_says_so)
     dist_context_destroy(ctx);
 }
 
+TEST(more_points_than_there_can_be_are_refused)
+{
+    dist_context *ctx = test_context();
+    dist_net *net = dist_net_load_file(ctx, "examples/model.safetensors");
+    dist_shape *shape = dist_shape_create(ctx, net, NULL);
+    dist_field field = dist_shape_field(shape);
+    dist_instance instance;
+    dist_gradients grads;
+    size_t n = (size_t)-1;
+    float p[4] = {0, 0, 0, 0}, d[3] = {0, 0, 0}, f[3];
+    dist_hit hit;
+    int index;
+    memset(&instance, 0, sizeof instance);
+    memset(&grads, 0, sizeof grads);
+    instance.field = &field;
+    dist_scene *scene = dist_scene_create(ctx, 1, &instance);
+    for (int k = 0; k < 2; k++, n /= 2) {
+        CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_eval(ctx, &field, n, p, f, NULL), ctx);
+        CHECK_TEXT("dist_field_eval: n is", dist_context_message(ctx));
+        CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_backward(ctx, &field, n, p, f, NULL, NULL, d, &grads), ctx);
+        CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_eikonal(ctx, &field, n, p, 1.0f, f, NULL), ctx);
+        CHECK_STATUS(DIST_BAD_ARGUMENT, dist_shape_eval(ctx, shape, n, p, f), ctx);
+        CHECK_STATUS(DIST_BAD_ARGUMENT, dist_scene_find(scene, n, p, &index), ctx);
+        CHECK_STATUS(DIST_BAD_ARGUMENT, dist_trace(ctx, &field, n, p, d, NULL, &hit, NULL), ctx);
+        CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_closest_point(ctx, &field, n, p, f, NULL, NULL), ctx);
+        CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_collide(ctx, &field, n, p, contacts), ctx);
+    }
+    CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, 1, p, d, NULL, &hit, NULL), ctx);
+    CHECK_EQUAL(DIST_RAY_NOT_FINITE, hit.status); /* d is 0 */
+    dist_scene_destroy(scene), dist_shape_destroy(shape), dist_net_destroy(net), dist_context_destroy(ctx);
+}
+
 /* Squares of these lengths do not fit a float. */
 TEST(points_far_beyond_the_sphere_have_a_nearest_point)
 {
@@ -544,6 +576,7 @@ int main(int argc, char **argv)
     RUN(spheres_that_are_clear_cost_one_query_or_none);
     RUN(spheres_touch_the_instance_that_is_there);
     RUN(what_has_no_answer_says_so);
+    RUN(more_points_than_there_can_be_are_refused);
     RUN(points_far_beyond_the_sphere_have_a_nearest_point);
     RUN(many_points_are_the_same_as_single_ones);
     return test_report();

@@ -4,7 +4,9 @@
 
    mode dense: every unit alive, so every multiply-add is done. dead: a real decoder at its own surface, where most
    units are zero and left out; its rate counts what a dense net would do. backward: value and gradient at the point;
-   backward_code: that and the code's gradient. f16, bf16, and f16_dead, bf16_dead: the hidden layers in 16 bits, where
+   backward_code: that and the code's gradient. Beside a real decoder are all_alive, all_alive_backward and
+   all_alive_backward_code: a net of the same layers without a dead unit at the same points; of_alive is a mode's time
+   over that net's, reverse_of_alive the same of what backward takes more than the forward pass. f16, bf16, and f16_dead, bf16_dead: the hidden layers in 16 bits, where
    the processor has the instructions, against the peak of those; max_error and rms_error are against f32. gflops counts
    the forward pass alone in all modes; of_forward is the time in f32 forward passes; executed is the share of the
    forward multiply-adds that was done. speedup, in f32 rows of several threads: their rate over that of one thread,
@@ -38,7 +40,7 @@ static const net_case cases[] = {
 };
 
 enum { CASES = sizeof cases / sizeof cases[0], REPETITIONS_MAX = 1001 };
-enum { FORWARD, BACKWARD, BACKWARD_CODE, F16, BF16, MODES };
+enum { FORWARD, BACKWARD, BACKWARD_CODE, ALIVE, ALIVE_BACKWARD, ALIVE_BACKWARD_CODE, F16, BF16, MODES };
 
 typedef struct settings {
     const char *only_case, *only_isa, *model;
@@ -50,10 +52,10 @@ typedef struct settings {
 typedef struct work {
     dist_context *ctx;
     int wall; /* by the clock, also with one thread */
-    dist_field field, half[2]; /* half: in f16 and bf16; without eval_fn: not here */
+    dist_field field, alive, half[2]; /* alive: without dead units; half: in f16 and bf16; without eval_fn: not here */
     size_t batch;
     const float *points;
-    float *sdf, *half_sdf, *gradient, *d_sdf, *d_code;
+    float *sdf, *other_sdf, *gradient, *d_sdf, *d_code; /* sdf: of f32 forward */
     double operations;
 } work;
 
@@ -67,14 +69,19 @@ static void seed_ones(void *user, size_t first, size_t count, const float *sdf, 
 
 static void work_once(const work *w, int mode)
 {
+    const dist_field *field = mode >= F16 ? &w->half[mode - F16] : mode >= ALIVE ? &w->alive : &w->field;
+    float *sdf = mode == FORWARD ? w->sdf : w->other_sdf;
     dist_gradients grads;
     memset(&grads, 0, sizeof grads);
     grads.code = w->d_code;
-    if (mode == FORWARD) { dist_field_eval(w->ctx, &w->field, w->batch, w->points, w->sdf, NULL); }
-    if (mode >= F16) { dist_field_eval(w->ctx, &w->half[mode - F16], w->batch, w->points, w->half_sdf, NULL); }
-    if (mode == BACKWARD) { dist_field_eval(w->ctx, &w->field, w->batch, w->points, w->sdf, w->gradient); }
-    if (mode == BACKWARD_CODE) {
-        dist_field_backward(w->ctx, &w->field, w->batch, w->points, w->d_sdf, seed_ones, NULL, w->gradient, &grads);
+    switch (mode) {
+    case BACKWARD:
+    case ALIVE_BACKWARD: dist_field_eval(w->ctx, field, w->batch, w->points, sdf, w->gradient); break;
+    case BACKWARD_CODE:
+    case ALIVE_BACKWARD_CODE:
+        dist_field_backward(w->ctx, field, w->batch, w->points, w->d_sdf, seed_ones, NULL, w->gradient, &grads);
+        break;
+    default: dist_field_eval(w->ctx, field, w->batch, w->points, sdf, NULL);
     }
 }
 
@@ -117,15 +124,18 @@ static double executed_share(const work *w, int mode)
 static int has_mode(const work *w, int mode)
 {
     if (mode == BACKWARD_CODE) { return w->d_code != NULL; }
-    return mode < F16 || w->half[mode - F16].eval_fn;
+    if (mode == ALIVE_BACKWARD_CODE) { return w->d_code && w->alive.eval_fn; }
+    return mode < ALIVE || (mode < F16 ? w->alive : w->half[mode - F16]).eval_fn;
 }
 
 /* Measures the modes of one net in turn with the peaks of their instructions, several times, and prints a row each.
    one: the same with one thread, or NULL */
 static void measure(const settings *s, const char *name, const work *w, const work *one, int dead)
 {
-    static const char *const names[2][MODES] = {{"dense", "backward", "backward_code", "f16", "bf16"},
-                                                {"dead", "backward", "backward_code", "f16_dead", "bf16_dead"}};
+    static const char *const names[2][MODES] = {
+        {"dense", "backward", "backward_code", "", "", "", "f16", "bf16"},
+        {"dead", "backward", "backward_code", "all_alive", "all_alive_backward", "all_alive_backward_code", "f16_dead",
+         "bf16_dead"}};
     static double peaks[3][REPETITIONS_MAX], times[MODES][REPETITIONS_MAX]; /* peaks: f32, f16, bf16 */
     double fastest[2][MODES] = {{0}}; /* passes a second, of one thread and of all */
     double highest[2] = {0, 0};
@@ -152,7 +162,7 @@ static void measure(const settings *s, const char *name, const work *w, const wo
         }
         for (int side = 0; side < (one ? 2 : 0); side++) {
             highest[side] = fmax(highest[side], peak_wall(side ? w : one, loops));
-            for (int m = 0; m < F16; m++) {
+            for (int m = 0; m < ALIVE; m++) {
                 if (!has_mode(w, m)) { continue; }
                 double seconds = side ? times[m][r] : work_time(one, m, passes[m]);
                 fastest[side][m] = fmax(fastest[side][m], 1 / (seconds + 1e-9));
@@ -166,21 +176,29 @@ static void measure(const settings *s, const char *name, const work *w, const wo
         double largest = 0;
         double squares = 0;
         if (!has_mode(w, m)) { continue; }
-        double executed = executed_share(w, m < F16 ? FORWARD : m);
+        double executed = executed_share(w, m < ALIVE ? FORWARD : m < F16 ? ALIVE : m);
         double peak = -quantile(n, peaks[m < F16 ? 0 : m - F16 + 1], share);
         double seconds = quantile(n, times[m], share);
         double rate = (double)w->batch / seconds;
         double gflops = 2e-9 * w->operations * rate;
         for (size_t i = 0; i < w->batch && m >= F16; i++) {
-            double e = fabs((double)w->half_sdf[i] - (double)w->sdf[i]);
+            double e = fabs((double)w->other_sdf[i] - (double)w->sdf[i]);
             largest = e > largest ? e : largest;
             squares += e * e;
         }
-        double speedup = one && m < F16 ? fastest[1][m] / fastest[0][m] : 0;
-        printf("%s,%s,%d,%.0f,%.6f,%.0f,%.1f,%.1f,%.3f,%s,%.2f,%.3f,%.3g,%.3g,%.3f,%.3f\n", name,
+        double speedup = one && m < ALIVE ? fastest[1][m] / fastest[0][m] : 0;
+        double of_alive = 0;
+        double reverse = 0;
+        if (m < ALIVE && has_mode(w, ALIVE + m)) {
+            double alive = quantile(n, times[ALIVE + m], share);
+            of_alive = seconds / alive;
+            reverse = m == FORWARD ? 0 : (seconds - forward) / (alive - quantile(n, times[ALIVE], share));
+        }
+        printf("%s,%s,%d,%.0f,%.6f,%.0f,%.1f,%.1f,%.3f,%s,%.2f,%.3f,%.3g,%.3g,%.3f,%.3f,%.3f,%.3f\n", name,
                dist_isa_name(dist_context_isa(w->ctx)), dist_context_workers(w->ctx), (double)w->batch, seconds, rate,
                gflops, peak, gflops / peak, names[dead][m], seconds / forward, executed, largest,
-               sqrt(squares / (double)w->batch), speedup, speedup > 0 ? highest[1] / highest[0] : 0);
+               sqrt(squares / (double)w->batch), speedup, speedup > 0 ? highest[1] / highest[0] : 0,
+               of_alive, reverse);
     }
     fflush(stdout);
 }
@@ -273,7 +291,7 @@ static void measure_net(const settings *s, const net_case *c, int isa, int threa
     if (!c) { w.batch = surface_points(w.ctx, &w.field, w.batch, points); }
     w.points = points;
     w.sdf = take_floats(w.batch);
-    w.half_sdf = take_floats(w.batch);
+    w.other_sdf = take_floats(w.batch);
     w.d_sdf = take_floats(w.batch);
     w.gradient = take_floats(3 * w.batch);
     if (dist_net_code_size(net)) { w.d_code = take_floats((size_t)dist_net_code_size(net)); }
@@ -289,6 +307,15 @@ static void measure_net(const settings *s, const net_case *c, int isa, int threa
         w.half[k] = dist_shape_field(shapes[k]);
         w.half[k].eval_fn = w.half[k].coarse_fn;
     }
+    dist_net *alive = NULL;
+    dist_shape *alive_shape = NULL;
+    if (!c && net->activation == DIST_ACTIVATION_RELU) {
+        alive = load_model(w.ctx, s->model);
+        make_alive(w.ctx, alive);
+        alive_shape = dist_shape_create(w.ctx, alive, code);
+        check(w.ctx);
+        w.alive = dist_shape_field(alive_shape);
+    }
     work one = w;
     desc.workers = 1;
     one.wall = 1;
@@ -299,13 +326,15 @@ static void measure_net(const settings *s, const net_case *c, int isa, int threa
     measure(s, c ? c->name : s->model, &w, alone ? &one : NULL, !c);
     dist_shape_destroy(alone);
     dist_context_destroy(one.ctx);
+    dist_shape_destroy(alive_shape);
+    dist_net_destroy(alive);
     for (int k = 0; k < 2; k++) {
         dist_shape_destroy(shapes[k]);
         dist_net_destroy(halves[k]);
     }
     free(points);
     free(w.sdf);
-    free(w.half_sdf);
+    free(w.other_sdf);
     free(w.d_sdf);
     free(w.gradient);
     free(w.d_code);
@@ -350,7 +379,7 @@ int main(int argc, char **argv)
     most = s.quick ? 1 : s.threads;
 #endif
     puts("case,isa,threads,batch,seconds,queries_per_s,gflops,peak_gflops,share,mode,of_forward,executed,max_error,"
-         "rms_error,speedup,peak_speedup");
+         "rms_error,speedup,peak_speedup,of_alive,reverse_of_alive");
     for (int i = 0; i < (s.model ? 1 : (int)CASES); i++) {
         const net_case *c = s.model ? NULL : &cases[i];
         if (c && s.only_case && strcmp(s.only_case, c->name) != 0) { continue; }

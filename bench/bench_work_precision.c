@@ -5,8 +5,8 @@
    The reference is found by small steps and bisection in double. Of a network the steps and the first bisection are
    dist_field_eval's; the hit is then moved to the root of the network in double (exact.h), its normal and the smallest
    |f| beside the outline are in double. The steps are those that the true slope proves (2.6 for networks), but at
-   least 1e-5 (networks: 5e-4). Of pictures larger than 256 x 256 as many pixels, spread evenly, are compared, and
-   counted, and have a share in the gradient (`pixels_compared`). Wrong pixels are counted against the surface itself,
+   least 1e-5 (networks: 5e-4). Of pictures larger than 256 x 256 (slow decoders, without --long: 128 x 128) as many
+   pixels, spread evenly, are compared, and counted, and have a share in the gradient (`pixels_compared`). Wrong pixels are counted against the surface itself,
    not against its epsilon:
        hole        the ray goes in by more than CLEAR, and mask is 0
        false hit   mask is 1, and the ray keeps farther than CLEAR from the surface; or misses the bounding sphere
@@ -28,7 +28,7 @@
 
    --minutes bounds what a case's size takes beside its reference: the rows come in order of importance, defaults first.
    One is made with fewer runs (column `runs`) if 7 would take more than an eighth of the time (at a size without
-   sweeps: a third), and is left out, with a word on stderr, where one would, or where no time is left; but not the
+   sweeps, but of slow decoders: a third), and is left out, with a word on stderr, where one would, or where no time is left; but not the
    defaults of guarded, certified and the paper's two fastest rows.
 
    --svg draws each case and size. Lines join the epsilons of one method, or its alphas or budgets of steps; the larger
@@ -47,8 +47,10 @@ static const char usage[] =
     "  --case NAME        only this one\n"
     "  --size N           only pictures of N x N (default 64, 128, 256 and 512)\n"
     "  --largest N        pictures of 64 x 64 up to N x N (default 512)\n"
-    "  --sweep N          sweeps at N x N alone; the other sizes get the defaults, and a third of --minutes\n"
-    "  --long             also 1024, and the slow decoders: 8 x 512 and with layer norm; --minutes 4\n"
+    "  --sweep N          sweeps at N x N alone; the other sizes get the defaults, and a third of --minutes (slow\n"
+    "                     decoders: all of it)\n"
+    "  --long             also 1024, and the slow decoders (8 x 512 and with layer norm) beyond 256 x 256, with more\n"
+    "                     pixels compared; --minutes 4\n"
     "  --minutes M        for each case and size, beside its reference (default: no bound)\n"
     "  --svg STEM         also plots, STEM_CASE_N.svg\n"
     "  --workers N        threads (default 1: then seconds vary least)\n"
@@ -56,7 +58,7 @@ static const char usage[] =
 
 enum { SPHERE, TORUS, BOX, RODS, BUMPS };
 #define CLEAR 2e-6
-#define MOST_COMPARED 256
+enum { MOST_COMPARED = 256, SLOW_COMPARED = 128, SLOW_LARGEST = 256 }; /* pixels along a side */
 #define NEAR 0.02
 
 typedef struct scene {
@@ -67,7 +69,7 @@ typedef struct scene {
     double clamp, slope;    /* true slope at most; the field says 1 */
     double elevation;       /* of the eye, degrees */
     int code, empty, quick; /* empty: the picture shows the upper half, the shape is in the lower */
-    int slow;
+    int slow;               /* its reference costs minutes if many pixels are compared */
 } scene;
 
 static const scene scenes[] = {
@@ -292,11 +294,11 @@ static void probe_exactly(const prober *p, size_t n, const ray *rays, double *sd
     if (p->s->net) { exact_eval(p->e, n, p->at, sdf, slopes ? p->gradient : NULL, NULL); }
 }
 
-/* One pixel of each square of a picture that is larger than MOST_COMPARED, chosen by chance: not those that the tracer
+/* One pixel of each square of a picture that has more than `most` along a side, chosen by chance: not those that the tracer
    treats in a way of their own. */
-static int is_compared(const dist_camera *camera, int i)
+static int is_compared(const dist_camera *camera, unsigned most, int i)
 {
-    unsigned side = ((unsigned)camera->width + MOST_COMPARED - 1) / MOST_COMPARED;
+    unsigned side = ((unsigned)camera->width + most - 1) / most;
     unsigned x = (unsigned)(i % camera->width), y = (unsigned)(i / camera->width);
     unsigned hash = (x / side * 73856093u) ^ (y / side * 19349663u);
     hash = (hash ^ (hash >> 13)) * 1540483477u;
@@ -304,8 +306,8 @@ static int is_compared(const dist_camera *camera, int i)
 }
 
 /* The rays that meet the bounding sphere, at their entry. */
-static size_t rays_of(const dist_field *field, const dist_camera *camera, double origin[3], unsigned char *status,
-                      ray *rays)
+static size_t rays_of(const dist_field *field, const dist_camera *camera, unsigned most, double origin[3],
+                      unsigned char *status, ray *rays)
 {
     size_t count = 0;
     disti_view eye;
@@ -318,7 +320,7 @@ static size_t rays_of(const dist_field *field, const dist_camera *camera, double
         double length = length_of(x, y, 1);
         double b = 0;
         double c = 0;
-        if (!is_compared(camera, i)) {
+        if (!is_compared(camera, most, i)) {
             status[i] = REF_SKIPPED;
             continue;
         }
@@ -455,7 +457,7 @@ static size_t march(const prober *p, reference *ref, size_t active, ray *rays, r
 }
 
 static reference reference_create(dist_context *ctx, const scene *s, const dist_field *field, exact *e,
-                                  const dist_camera *camera)
+                                  const dist_camera *camera, unsigned most)
 {
     reference ref;
     prober p;
@@ -479,7 +481,7 @@ static reference reference_create(dist_context *ctx, const scene *s, const dist_
     p.e = e;
     p.at = (double *)take(3 * ref.n, sizeof(double));
     p.gradient = (double *)take(3 * ref.n, sizeof(double));
-    ref.in_sphere = rays_of(field, camera, ref.origin, ref.status, rays);
+    ref.in_sphere = rays_of(field, camera, most, ref.origin, ref.status, rays);
     for (size_t i = 0; i < ref.n; i++) { ref.smallest[i] = ref.dip[i] = 1e30; }
     for (size_t i = 0; i < ref.in_sphere; i++) { ref.status[rays[i].pixel] = REF_MISS; }
     size_t hit_count = march(&p, &ref, ref.in_sphere, rays, hits, misses, sdf);
@@ -958,7 +960,8 @@ typedef struct sweep {
     dist_camera camera;
     reference ref;
     half halves[2]; /* F16, BF16 */
-    int quick, sweep_size;   /* the size at which parameters are swept; 0: each */
+    int quick, all_slow;     /* slow scenes at all sizes, and as many pixels compared as of others */
+    int sweep_size;          /* the size at which parameters are swept; 0: each */
     double most, end, share; /* seconds for a case's size, 0: no bound; when they are over; a row's part of them */
     double seconds[METHODS]; /* of a default picture, here or, times four, of half the size; 0: not known */
     const char *svg;         /* stem of the plots' names; NULL: none */
@@ -1060,11 +1063,12 @@ static void sweep_field(sweep *w, int size)
     size_t first = w->count;
     double most = w->most;
     int defaults = w->sweep_size && w->sweep_size != size;
-    if (defaults) { w->most = most / 3; }
-    w->share = defaults ? 3 : 8;
+    if (defaults && !w->subject.s->slow) { w->most = most / 3; }
+    w->share = w->most < most ? 3 : 8;
     subject *j = &w->subject;
     w->camera = camera_of(j->s, j->field, size);
-    w->ref = reference_create(j->ctx, j->s, j->field, j->e, &w->camera);
+    unsigned compared = j->s->slow && !w->all_slow ? SLOW_COMPARED : MOST_COMPARED;
+    w->ref = reference_create(j->ctx, j->s, j->field, j->e, &w->camera, compared);
     j->camera = &w->camera;
     j->ref = &w->ref;
     j->exact = (double *)take(6 + j->code_size, sizeof(double));
@@ -1113,6 +1117,7 @@ static void run_scene(sweep *w, const scene *s, int only_size, int most)
     w->subject.shape = shape;
     w->subject.e = net ? &e : NULL;
     w->subject.code_size = net ? (size_t)dist_net_code_size(net) : 0;
+    if (s->slow && !w->all_slow && most > SLOW_LARGEST) { most = SLOW_LARGEST; }
     for (int size = only_size ? only_size : 64; size <= (only_size ? only_size : most); size *= 2) {
         sweep_field(w, size);
     }
@@ -1230,7 +1235,6 @@ int main(int argc, char **argv)
 {
     const char *only = NULL;
     int only_size = 0;
-    int slow = 0;
     int largest = 0;
     dist_context_desc settings = {.workers = 1};
     sweep w;
@@ -1246,7 +1250,7 @@ int main(int argc, char **argv)
         } else if (option_is(&o, "--sweep")) {
             w.sweep_size = option_int(&o, 8, 4096);
         } else if (option_is(&o, "--long")) {
-            slow = option_flag(&o);
+            w.all_slow = option_flag(&o);
         } else if (option_is(&o, "--minutes")) {
             w.most = 60 * option_number(&o, 1e-3, 1e6);
         } else if (option_is(&o, "--svg")) {
@@ -1259,7 +1263,7 @@ int main(int argc, char **argv)
             option_unknown(&o);
         }
     }
-    if (slow && !(w.most > 0)) { w.most = 240; }
+    if (w.all_slow && !(w.most > 0)) { w.most = 240; }
     w.subject.ctx = dist_context_create(&settings);
     check(w.subject.ctx);
     w.rows = (row *)take(MOST_ROWS, sizeof *w.rows);
@@ -1270,8 +1274,8 @@ int main(int argc, char **argv)
          "camera_cosine,camera_norm_error,pixels_compared,gradient_seconds");
     for (int i = 0; i < SCENES; i++) {
         const scene *s = &scenes[i];
-        int wanted = only ? strcmp(only, s->name) == 0 : w.quick ? s->quick : slow || !s->slow;
-        if (wanted) { run_scene(&w, s, only_size, largest ? largest : w.quick ? 64 : slow ? 1024 : 512); }
+        int wanted = only ? strcmp(only, s->name) == 0 : !w.quick || s->quick;
+        if (wanted) { run_scene(&w, s, only_size, largest ? largest : w.quick ? 64 : w.all_slow ? 1024 : 512); }
     }
     print_worst(w.rows, w.count);
     if (w.svg) { plot_losses(w.svg, w.rows, w.count); }

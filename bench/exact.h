@@ -92,20 +92,26 @@ static inline void exact_encode(const exact *e, const double *points, double *d_
     }
 }
 
-/* y += scale * w x for `count` columns of one row of weights; backward: d_x += scale * w^T delta. */
+/* y += scale * w x for `count` columns of one row of weights; backward: d_x += scale * w^T delta. What stays the same in
+   the loop is copied, since it might overlap the rest for all that a compiler knows. */
 static inline void exact_row(const float *w, int count, double scale, const double *x, double *y)
 {
+    double sum[EXACT_BLOCK];
+    memcpy(sum, y, sizeof sum);
     for (int k = 0; k < count; k++) {
         double by = scale * (double)w[k];
-        for (int c = 0; c < EXACT_BLOCK; c++) { y[c] += by * x[k * EXACT_BLOCK + c]; }
+        for (int c = 0; c < EXACT_BLOCK; c++) { sum[c] += by * x[k * EXACT_BLOCK + c]; }
     }
+    memcpy(y, sum, sizeof sum);
 }
 
 static inline void exact_row_backward(const float *w, int count, double scale, const double *delta, double *d_x)
 {
+    double d[EXACT_BLOCK];
+    memcpy(d, delta, sizeof d);
     for (int k = 0; k < count; k++) {
         double by = scale * (double)w[k];
-        for (int c = 0; c < EXACT_BLOCK; c++) { d_x[k * EXACT_BLOCK + c] += by * delta[c]; }
+        for (int c = 0; c < EXACT_BLOCK; c++) { d_x[k * EXACT_BLOCK + c] += by * d[c]; }
     }
 }
 

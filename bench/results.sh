@@ -84,6 +84,7 @@ if [ -n "$python" ]; then
 fi
 
 # Sweeps at one size, defaults at all; build/bench_work_precision --long sweeps at each. Plots of some: each is 0.2 MB.
+# About half an hour on one thread, of which the slow decoders take two minutes each.
 mkdir -p build/work_precision || exit 1
 if [ -n "$quick" ]; then
     csv work_precision build/bench_work_precision --quick --case embedded_5 --largest 128 --sweep 64 \
@@ -127,8 +128,9 @@ guarded_bf16" '
                   for (m = 1; m <= count; m++) line = line cell(method[m])
                   print line } }' "$folder/work_precision.csv"
     echo
-    echo "The default as pictures grow, in the same way, with the median of the seconds. Of pictures larger than 256 x 256 as"
-    echo "many pixels, spread evenly, are compared, and counted."
+    echo "The default as pictures grow, in the same way, with the median of the seconds. Of pictures larger than 256 x 256"
+    echo "(chairs_3, spot_512 and spot_512_he: than 128 x 128, and none beyond 256) as many pixels, spread evenly, are"
+    echo "compared, and counted."
     echo
     awk -F , '
         /^#/ || /^case/ { next }

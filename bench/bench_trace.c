@@ -13,7 +13,7 @@ static const char usage[] =
     "  --ladder MODEL     the paper's rows and the guarded tracer on one decoder, beside the paper's own counts;\n"
     "                     a file, the word embedded, or sphere, torus or box\n"
     "  --code N           its code (default 0)\n"
-    "  --size N           pixels along a side (default 512)\n"
+    "  --size N           pixels along a side (default 512; without --ladder: 128, 256 and 512)\n"
     "  --steps N          of the paper's rows: 50 (default) or 100\n"
     "  --case NAME        without --ladder: only this one\n"
     "  --slow             also the decoders of 8 x 512 and with layer norm\n"
@@ -72,13 +72,14 @@ static void ladder(dist_context *ctx, const char *name, const dist_field *field,
     reference_destroy(&ref);
 }
 
-static void run_case(dist_context *ctx, const trace_case *c, int quick)
+/* only_size 0: several. */
+static void run_case(dist_context *ctx, const trace_case *c, int only_size, int quick)
 {
     dist_net *net = c->net ? load_net_or_skip(ctx, c->net) : NULL;
     if (c->net && !net) { return; }
     dist_shape *shape = NULL;
     dist_field field = field_of(ctx, c->name, net, c->code, &shape);
-    for (int size = 128; size <= 512; size *= quick ? 4 : 2) {
+    for (int size = only_size ? only_size : 128; size <= (only_size ? only_size : 512); size *= quick ? 4 : 2) {
         dist_camera camera = bench_camera(&field, size, size);
         reference ref = reference_create(ctx, &field, &camera);
         for (int m = FIRST_SHORT; m < METHODS; m++) {
@@ -99,7 +100,7 @@ int main(int argc, char **argv)
     const char *ladder_of = NULL;
     const char *only = NULL;
     int code = 0;
-    int size = 512;
+    int size = 0;
     int steps = 50;
     int slow = 0;
     int quick = 0;
@@ -130,14 +131,14 @@ int main(int argc, char **argv)
         dist_shape *shape = NULL;
         dist_net *net = is_analytic(ladder_of) ? NULL : load_model(ctx, ladder_of);
         dist_field field = field_of(ctx, ladder_of, net, code, &shape);
-        ladder(ctx, ladder_of, &field, size, steps);
+        ladder(ctx, ladder_of, &field, size ? size : 512, steps);
         dist_shape_destroy(shape);
         dist_net_destroy(net);
     }
     for (int i = 0; !ladder_of && i < CASES; i++) {
         const trace_case *c = &cases[i];
         int wanted = only ? strcmp(only, c->name) == 0 : quick ? c->quick : slow || !c->slow;
-        if (wanted) { run_case(ctx, c, quick); }
+        if (wanted) { run_case(ctx, c, size, quick); }
     }
     dist_context_destroy(ctx);
     return 0;

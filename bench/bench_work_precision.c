@@ -5,7 +5,7 @@
    The reference is found by small steps and bisection in double. Of a network the steps and the first bisection are
    dist_field_eval's; the hit is then moved to the root of the network in double (exact.h), its normal and the smallest
    |f| beside the outline are in double. The steps are those that the true slope proves (2.6 for networks), but at
-   least 1e-5 (networks: 5e-4). Of pictures larger than 256 x 256 (slow decoders, without --long: 128 x 128) as many
+   least 1e-5 (networks: 5e-5). Of pictures larger than 256 x 256 (slow decoders, without --long: 128 x 128) as many
    pixels, spread evenly, are compared, and counted, and have a share in the gradient (`pixels_compared`). Wrong pixels are counted against the surface itself,
    not against its epsilon:
        hole        the ray goes in by more than CLEAR, and mask is 0
@@ -419,7 +419,7 @@ static void smallest(const prober *p, size_t n, ray *rays, double *sdf, double *
 /* Marches every ray to its first f < 0; returns how many cross, and sorts hits and misses into their arrays. */
 static size_t march(const prober *p, reference *ref, size_t active, ray *rays, ray *hits, ray *misses, double *sdf)
 {
-    double shortest = p->s->net ? 5e-4 : 1e-5;
+    double shortest = p->s->net ? 5e-5 : 1e-5;
     size_t hit_count = 0;
     size_t miss_count = 0;
     for (int round = 0; active; round++) {

@@ -185,7 +185,7 @@ static inline reference reference_create(dist_context *ctx, const dist_field *fi
             }
             if (sdf[i] < ref.smallest[r.pixel]) { ref.smallest[r.pixel] = sdf[i]; }
             r.previous = r.t;
-            r.t += fmaxf(sdf[i] / 2.6f, 5e-4f);
+            r.t += fmaxf(sdf[i] / 2.6f, 5e-5f);
             if (r.t < r.exit) { rays[kept++] = r; }
         }
         active = kept;

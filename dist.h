@@ -482,8 +482,8 @@ enum {
 typedef struct dist_render_desc {
     int max_steps;       /* queries per ray at most; 0: 100 guarded, 1000 certified, 50 paper */
     float step_scale;    /* alpha; 0: 1.5 (paper: rows aggressive and coarse-to-fine). Above 0 */
-    float epsilon; /* largest |f| of a hit, shape units; 0: 5e-5, or less where a pixel is smaller (see the README). The
-                      guarded tracer takes at most half of field.clamp */
+    float epsilon; /* largest |f| of a hit, shape units; 0: 5e-5 of the bounding radius or field.detail, or less where a
+                      pixel is smaller (paper: 5e-5). The guarded tracer takes at most half of field.clamp */
     int samples;         /* K of the paper's gradient, 1 to 8; 0: 1 */
     int trace;           /* DIST_TRACE_* */
     int paper_row;       /* DIST_PAPER_* */
@@ -518,7 +518,8 @@ typedef struct dist_render_desc {
                             not finish are UNRESOLVED */
 } dist_render_desc;
 
-/* What will be used: every 0 replaced by its default. */
+/* What will be used: every 0 replaced by its default; the guarded tracer's epsilon, normal_delta and lipschitz, which go
+   by the field, stay 0. */
 DIST_API dist_render_desc dist_render_desc_resolve(const dist_render_desc *desc);
 
 typedef struct dist_stats {
@@ -8170,7 +8171,6 @@ DIST_API dist_render_desc dist_render_desc_resolve(const dist_render_desc *desc)
     if (how.gradient == DIST_GRADIENT_AUTO)
         how.gradient = how.trace == DIST_TRACE_PAPER ? DIST_GRADIENT_PAPER : DIST_GRADIENT_IMPLICIT;
     if (how.gradient_cap == 0.0f) how.gradient_cap = 0.1f;
-    if (how.normal_delta == 0.0f) how.normal_delta = 1e-3f;
     return how;
 }
 
@@ -8226,7 +8226,7 @@ static dist_status disti_tracer_init(disti_tracer *tracer, dist_context *ctx, co
     tracer->field = field;
     tracer->how = dist_render_desc_resolve(desc);
     tracer->detail = field->detail > 0.0f ? field->detail : field->radius;
-    if (!desc || desc->normal_delta == 0.0f) tracer->how.normal_delta = 1e-3f * tracer->detail;
+    if (tracer->how.normal_delta == 0.0f) tracer->how.normal_delta = 1e-3f * tracer->detail;
     tracer->lipschitz = tracer->how.lipschitz > 0.0f ? tracer->how.lipschitz
                         : field->lipschitz > 0.0f    ? field->lipschitz
                                                      : 1.0f;

@@ -836,7 +836,7 @@ static void image_check(scene *s, int plane, const dist_render_desc *how, double
         memset(&wanted, 0, sizeof wanted);
     if (wanted.gradient == DIST_GRADIENT_AUTO) wanted.gradient = DIST_GRADIENT_IMPLICIT;
     job.how = dist_render_desc_resolve(&wanted);
-    if (wanted.normal_delta > 0.0f) job.how.normal_delta = wanted.normal_delta;
+    if (job.how.normal_delta == 0.0f) job.how.normal_delta = 1e-3f * s->field.radius;
     dist_tape *tape = pictures_take(&a, s, &wanted);
     for (int i = 0; i < PIXELS; i++) {
         int use = pixel_use(s, &job, &a, tape, i);

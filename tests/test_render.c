@@ -1360,6 +1360,31 @@ TEST(a_query_budget_of_free_rays_is_kept)
     dist_context_destroy(ctx);
 }
 
+/* What goes by the field's radius is not fixed before the field is known. */
+TEST(a_resolved_desc_gives_the_same_picture)
+{
+    enum { EDGE = 24 };
+    static float normal[2][3 * EDGE * EDGE];
+    static float depth[2][EDGE * EDGE];
+    float radii[5] = {0, 0, 0, 12, 5}, eye[3] = {0, 30, 40}, at[3] = {0, 0, 0}, up[3] = {0, 1, 0};
+    dist_context *ctx = test_context();
+    dist_field field = dist_field_torus(radii);
+    dist_camera camera = dist_camera_look_at(EDGE, EDGE, 0.7f, eye, at, up);
+    dist_render_desc how;
+    memset(&how, 0, sizeof how);
+    how.normal_mode = DIST_NORMAL_DIFFERENCE;
+    for (int k = 0; k < 2; k++, how = dist_render_desc_resolve(&how)) {
+        dist_images out;
+        memset(&out, 0, sizeof out);
+        out.depth = depth[k];
+        out.normal = normal[k];
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+    }
+    CHECK_BYTES(sizeof depth[0], depth[0], depth[1]);
+    CHECK_BYTES(sizeof normal[0], normal[0], normal[1]);
+    dist_context_destroy(ctx);
+}
+
 int main(int argc, char **argv)
 {
     test_begin(argc, argv);
@@ -1397,5 +1422,6 @@ int main(int argc, char **argv)
     RUN(a_query_budget_gives_the_same_bits_for_every_number_of_workers);
     RUN(extreme_budgets_give_the_best_so_far_and_leave_no_trace);
     RUN(a_query_budget_of_free_rays_is_kept);
+    RUN(a_resolved_desc_gives_the_same_picture);
     return test_report();
 }

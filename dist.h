@@ -518,8 +518,8 @@ typedef struct dist_render_desc {
                             not finish are UNRESOLVED */
 } dist_render_desc;
 
-/* What will be used: every 0 replaced by its default; the guarded tracer's epsilon, normal_delta and lipschitz, which go
-   by the field, stay 0. */
+/* What will be used: every 0 replaced by its default; the guarded tracer's epsilon, normal_delta and lipschitz, which
+   go by the field, stay 0. */
 DIST_API dist_render_desc dist_render_desc_resolve(const dist_render_desc *desc);
 
 typedef struct dist_stats {

@@ -3003,7 +3003,7 @@ static void disti_cross(const double a[3], const double b[3], double c[3])
 }
 
 /* Scales to unit length; 0 and leaves it alone if that cannot be done. */
-static int disti_normalize(double a[3])
+DISTI_INLINE int disti_normalize(double a[3])
 {
     double length = sqrt(disti_dot(a, a));
     if (!(length > 1e-150)) return 0;
@@ -8817,7 +8817,8 @@ typedef struct disti_bench { /* the work bench of one task */
     float *points;     /* (DISTI_TILE_RAYS, 3) */
     float *sdf;        /* DISTI_TILE_RAYS */
     float *gradient;   /* NULL, or (2, DISTI_TILE_RAYS, 3): of a round's samples, and grad f at hits that are `own` */
-    float *depth;      /* DISTI_TILE_RAYS: of the rays that are hits so far, for their neighbors; 0: none */
+    float *depth;      /* DISTI_TILE_RAYS: of the rays that are hits so far, for their neighbors; 0: none,
+                          below: nor has it set out */
     int *index;        /* DISTI_TILE_RAYS */
     unsigned char *rest; /* what else a task wants: DISTI_REST_BYTES */
     disti_balls *balls;  /* NULL: rays do not share */
@@ -9128,8 +9129,10 @@ static size_t disti_trace_rounds(const disti_tracer *tracer, int worker, const d
 static void disti_trace_all(const disti_tracer *tracer, int worker, const disti_bench *bench, size_t n)
 {
     size_t active = 0;
-    for (size_t i = 0; i < n; i++)
+    for (size_t i = 0; i < n; i++) {
+        bench->depth[i] = disti_hit_depth(&bench->rays[i]); /* of a warm start */
         if (bench->rays[i].mode != DISTI_DONE) bench->index[active++] = (int)i;
+    }
     disti_trace_rounds(tracer, worker, bench, active, 0);
 }
 
@@ -9523,12 +9526,11 @@ static void disti_ray_skip(disti_ray *ray)
     ray->status = DIST_RAY_SKIPPED; /* mode is DISTI_DONE, and the sphere is not met: enter = leave */
 }
 
-/* A ray that misses, and of which no more is wanted. */
+/* A ray that misses, and of which no more is wanted: it is not even made. */
 static void disti_ray_close(disti_ray *ray)
 {
     ray->mode = DISTI_DONE;
     ray->status = DIST_RAY_MISS;
-    ray->enter = ray->leave = 0.0f;
 }
 
 /* Makes the rays of pixels x0..x1-1, y0..y1-1 of the tile, as disti_pixel_ray does. */
@@ -9545,13 +9547,13 @@ static void disti_tile_rays(const disti_tracer *tracer, const disti_tile *tile, 
         double skewed = view->cx + view->skew * v - view->first;
         double row[3] = {m[3] * v + m[6], m[4] * v + m[7], m[5] * v + m[8]};
         disti_ray *ray = bench->rays + y * tile->width + x0;
+        memset(ray, 0, (size_t)(x1 - x0) * sizeof *ray);
         for (int x = tile->x + x0; x < tile->x + x1; x++, ray++) {
             if (pixels && !pixels[(size_t)(tile->y + y) * (size_t)view->width + (size_t)x]) {
                 disti_ray_skip(ray);
                 continue;
             }
             double u = ((double)x - skewed) / view->fx, cosine = 1.0 / sqrt(u * u + v * v + 1.0);
-            memset(ray, 0, sizeof *ray);
             disti_ray_place(tracer->field, c[0], c[1], c[2], (m[0] * u + row[0]) * cosine,
                             (m[1] * u + row[1]) * cosine, (m[2] * u + row[2]) * cosine, per_pixel * cosine * cosine,
                             ray);
@@ -9791,7 +9793,7 @@ static int disti_cones(const disti_tracer *tracer, int worker, const disti_tile 
             disti_tile_rays(tracer, tile, bench, cone->x, cone->y, x1, y1);
         for (int y = cone->y; tile->lazy && cone->state == DISTI_CONE_THROUGH && y < y1; y++)
             for (int x = cone->x; x < x1; x++) disti_ray_close(&bench->rays[y * tile->width + x]);
-        disti_cone_finish(tracer, tile, bench, cone);
+        if (!tile->lazy || cone->state == DISTI_CONE_BLOCKED) disti_cone_finish(tracer, tile, bench, cone);
     }
     return blocked;
 }
@@ -9835,8 +9837,9 @@ static disti_guess disti_predict_axis(const disti_tracer *tracer, const disti_ra
     float flatter = DISTI_MAX(slope1, slope2), mean = 0.5f * (slope1 + slope2), gap = z1 < z2 ? z2 - z1 : z1 - z2;
     if (!(flatter < 0.0f)) return guess;
     /* a plane inclined as the slopes say, not a step: |dz| <= tan(angle) times their distance, 2 h pixels */
-    float tangent = sqrtf(DISTI_MAX(tracer->lipschitz * tracer->lipschitz - mean * mean, 0.0f)) / -mean;
-    float across = 4.0f * (float)h * ray->footprint * DISTI_MAX(z1, z2);
+    float across = 4.0f * (float)h * ray->footprint * DISTI_MAX(z1, z2), tangent = 0.0f;
+    if (gap > 1.2f * 0.3f * across)
+        tangent = sqrtf(DISTI_MAX(tracer->lipschitz * tracer->lipschitz - mean * mean, 0.0f)) / -mean;
     float inverse = 0.5f * (1.0f / z1 + 1.0f / z2);
     guess.slope = mean;
     guess.differ = 3e38f;
@@ -9868,7 +9871,7 @@ static int disti_predict(const disti_tracer *tracer, const disti_tile *tile, con
 {
     disti_ray *ray = &bench->rays[y * tile->width + x];
     float *depth = &bench->depth[y * tile->width + x];
-    int odd_x = x / h & 1, odd_y = y / h & 1;
+    int odd_x = x & h, odd_y = y & h;
     disti_guess guess, other;
     guess = disti_predict_axis(tracer, ray, depth, odd_x ? x : y, odd_x ? tile->width : tile->height, h,
                                odd_x ? 1 : tile->width);
@@ -9972,8 +9975,12 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
             disti_ray *ray = &bench->rays[i];
             bench->depth[i] = disti_hit_depth(ray); /* of a warm start */
             if (ray->mode == DISTI_DONE) continue;
-            if (x % DISTI_LATTICE == 0 && y % DISTI_LATTICE == 0) bench->index[active++] = i;
-            else ray->mode = DISTI_WAIT;
+            if (x % DISTI_LATTICE == 0 && y % DISTI_LATTICE == 0) {
+                bench->index[active++] = i;
+                continue;
+            }
+            ray->mode = DISTI_WAIT;
+            bench->depth[i] = -1.0f;
         }
     }
     active = disti_trace_rounds(tracer, worker, bench, active, DISTI_LATER);
@@ -9989,9 +9996,9 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
         if (bench->balls) bench->balls->window = DISTI_MIN(h + 3, 6);
         for (int pass = 1; pass <= 2; pass++) { /* between two known pixels, then amid four */
             for (int y = pass == 1 ? 0 : h; y < tile->height; y += pass == 1 ? h : 2 * h) {
-                for (int x = pass == 1 && y % (2 * h) != 0 ? 0 : h; x < tile->width; x += 2 * h) {
+                for (int x = pass == 1 && y & h ? 0 : h; x < tile->width; x += 2 * h) {
                     int index = y * tile->width + x;
-                    if (bench->rays[index].mode != DISTI_WAIT) continue;
+                    if (!(bench->depth[index] < 0.0f) || bench->rays[index].mode != DISTI_WAIT) continue;
                     if (disti_predict(tracer, tile, bench, x, y, h)) bench->index[active++] = index;
                     else if (bench->budget) bench->budget->hits++;
                 }
@@ -10011,18 +10018,20 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
 static void disti_trace_doubt(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench)
 {
     int n = tile->width * tile->height;
-    for (int i = 0; i < n; i++) bench->depth[i] = disti_hit_depth(&bench->rays[i]);
-    for (int i = 0; i < n; i++) {
-        disti_ray *ray = &bench->rays[i];
+    float most = 0.02f * tracer->field->radius;
+    for (int i = 0, x = -1, y = 0; i < n; i++) {
+        if (++x == tile->width) x = 0, y++;
         const float *depth = bench->depth + i;
         float z = *depth, doubt = 0.0f;
         if (!(z > 0.0f)) continue;
-        float falls = ray->slope < 0.0f ? -ray->slope : ray->slope, most = 0.02f * tracer->field->radius;
-        float flat = 6.0f * disti_ray_epsilon(tracer, ray, ray->best);
-        if (falls < 0.06f * tracer->lipschitz && ray->sign > 0.0f)
+        disti_ray *ray = &bench->rays[i];
+        float falls = ray->slope < 0.0f ? -ray->slope : ray->slope;
+        if (falls < 0.06f * tracer->lipschitz && ray->sign > 0.0f) {
+            float flat = 6.0f * disti_ray_epsilon(tracer, ray, ray->best);
             ray->error = DISTI_MAX(ray->error, flat < most * falls ? flat / falls : most);
+        }
         for (int axis = 0; axis < 2; axis++) {
-            int at = axis ? i / tile->width : i % tile->width, end = axis ? tile->height : tile->width;
+            int at = axis ? y : x, end = axis ? tile->height : tile->width;
             int stride = axis ? tile->width : 1;
             float z1 = disti_depth_beside(depth, at, end, -1, stride);
             float z2 = disti_depth_beside(depth, at, end, 1, stride);
@@ -10692,21 +10701,6 @@ static void disti_normal_gradient(const disti_tracer *tracer, int worker, const 
         if (!disti_finite_all(3, gradient + 3 * i)) gradient[3 * i] = gradient[3 * i + 1] = gradient[3 * i + 2] = 0.0f;
 }
 
-/* The tile's next hits from ray *i on, at most DISTI_GRADIENTS: their points and, in bench->index, which rays. known 0:
-   but those whose gradient is known. */
-static size_t disti_render_hits(const disti_render_job *job, const disti_tile *tile, const disti_bench *bench,
-                                int known, int *i, float *points)
-{
-    size_t count = 0;
-    for (; *i < tile->width * tile->height && count < DISTI_GRADIENTS; ++*i) {
-        const disti_ray *ray = &bench->rays[*i];
-        if (!disti_ray_is_hit(job->tracer, ray) || (ray->own && !known)) continue;
-        disti_ray_point(ray, ray->best, points + 3 * count);
-        bench->index[count++] = *i;
-    }
-    return count;
-}
-
 static void disti_render_normal(const disti_render_job *job, const disti_tile *tile, int index, const float *gradient)
 {
     double g[3] = {(double)gradient[0], (double)gradient[1], (double)gradient[2]}, normal[3];
@@ -10717,33 +10711,40 @@ static void disti_render_normal(const disti_render_job *job, const disti_tile *t
     for (size_t axis = 0; axis < 3; axis++) to[axis] = (float)normal[axis];
 }
 
+/* Normals of the tile's hits, `hits` rays listed in bench->index. */
 static void disti_render_normals(const disti_render_job *job, int worker, const disti_tile *tile,
-                                 const disti_bench *bench)
+                                 const disti_bench *bench, size_t hits)
 {
-    const disti_tracer *tracer = job->tracer;
     float *points = (float *)(void *)bench->rest + 6 * DISTI_TILE_RAYS, *gradient = points + 3 * DISTI_GRADIENTS;
-    size_t count;
-    for (int i = 0; i < tile->width * tile->height; i++)
-        if (disti_ray_is_hit(tracer, &bench->rays[i]) && bench->rays[i].own)
-            disti_render_normal(job, tile, i, disti_bench_gradient(bench, i));
-    for (int i = 0; (count = disti_render_hits(job, tile, bench, 0, &i, points)) > 0;) {
-        disti_normal_gradient(tracer, worker, bench, count, points, gradient);
-        for (size_t k = 0; k < count; k++) disti_render_normal(job, tile, bench->index[k], gradient + 3 * k);
+    for (size_t i = 0, from = 0; i < hits; from = i) {
+        size_t count = 0;
+        for (; i < hits && count < DISTI_GRADIENTS; i++) {
+            const disti_ray *ray = &bench->rays[bench->index[i]];
+            if (ray->own) disti_render_normal(job, tile, bench->index[i], disti_bench_gradient(bench, bench->index[i]));
+            else disti_ray_point(ray, ray->best, points + 3 * count++);
+        }
+        if (count > 0) disti_normal_gradient(job->tracer, worker, bench, count, points, gradient);
+        for (count = 0; from < i; from++)
+            if (!bench->rays[bench->index[from]].own)
+                disti_render_normal(job, tile, bench->index[from], gradient + 3 * count++);
     }
 }
 
 static void disti_render_colors(const disti_render_job *job, int worker, const disti_tile *tile,
-                                const disti_bench *bench)
+                                const disti_bench *bench, size_t hits)
 {
     const dist_field *field = job->tracer->field;
     float *points = (float *)(void *)bench->rest, *color = points + 3 * DISTI_GRADIENTS;
-    size_t count;
-    for (int i = 0; (count = disti_render_hits(job, tile, bench, 1, &i, points)) > 0;) {
+    for (size_t i = 0, count; i < hits; i += count) {
+        const int *index = bench->index + i;
+        count = DISTI_MIN(hits - i, (size_t)DISTI_GRADIENTS);
+        for (size_t k = 0; k < count; k++)
+            disti_ray_point(&bench->rays[index[k]], bench->rays[index[k]].best, points + 3 * k);
         field->color_fn(field->user, worker, count, points, color);
         bench->stats->queries += count;
         bench->stats->color_queries += count;
         for (size_t k = 0; k < count; k++) {
-            size_t pixel = disti_tile_pixel(tile, bench->index[k]);
+            size_t pixel = disti_tile_pixel(tile, index[k]);
             for (size_t c = 0; c < 3; c++) /* a net may overflow */
                 job->out->color[3 * pixel + c] =
                     disti_finite(color[3 * k + c]) ? color[3 * k + c] : job->tracer->how.background_color[c];
@@ -10844,30 +10845,44 @@ static void disti_render_empty(const disti_render_job *job, const disti_tile *ti
     bench->stats->rays += (unsigned long long)tile->own_width * (unsigned long long)tile->own_height;
 }
 
-static void disti_render_planes(const disti_render_job *job, const disti_tile *tile, const disti_bench *bench)
+/* The pixels of a tile; its hits are listed in bench->index for what only they have. */
+static void disti_render_planes(const disti_render_job *job, int worker, const disti_tile *tile,
+                                const disti_bench *bench)
 {
     int plain = !job->out->silhouette && !job->tape && !tile->list;
+    size_t hits = 0;
     for (int y = 0; y < tile->own_height; y++) {
         const disti_ray *ray = bench->rays + y * tile->width;
+        size_t first = tile->list ? 0 : disti_tile_pixel(tile, y * tile->width);
         for (int x = 0; x < tile->own_width;) {
-            size_t pixel = disti_tile_pixel(tile, y * tile->width + x), count = 0;
+            size_t pixel = tile->list ? tile->list[x] : first + (size_t)x, count = 0;
             for (; plain && x < tile->own_width && ray->status == DIST_RAY_MISS; x++, ray++, count++)
-                bench->stats->rays_in_sphere += ray->enter < ray->leave;
+                if (!tile->lazy) bench->stats->rays_in_sphere += ray->enter < ray->leave; /* else they have been */
             bench->stats->rays += count;
             if (count > 0) disti_render_nothing(job, pixel, count);
             if (count > 0) continue;
+            if (disti_ray_is_hit(job->tracer, ray)) bench->index[hits++] = y * tile->width + x;
             disti_stats_ray(job->tracer, ray, bench->stats);
             disti_render_pixel(job, ray++, pixel);
             x++;
         }
     }
+    if (job->out->normal) disti_render_normals(job, worker, tile, bench, hits);
+    if (job->out->color) disti_render_colors(job, worker, tile, bench, hits);
 }
 
 /* Adds the pixels whose rays meet the bounding sphere: with b = c . d and k = |c|^2 - radius^2 those with b < 0 and
-   b^2 > k |d|^2, or all from within it; c: the camera, from the center; d = (u, v, 1), rotated to the world. */
+   b^2 > k |d|^2, or all from within it; c: the camera, from the center; d = (u, v, 1), rotated to the world. They are a
+   run of the row's (the sphere's picture is convex), so all are if both ends are. */
 DISTI_LOOPS static unsigned disti_row_meets(int n, double first, double scale, double b0, double b1, double w, double k)
 {
     unsigned count = 0;
+    for (int i = 0, step = DISTI_MAX(n - 1, 1); i < n; i += step) {
+        double u = (first + (double)i) * scale, b = b0 + b1 * u;
+        count += (b < 0.0) & (b * b > k * (u * u + w));
+    }
+    if (count == 2) return (unsigned)n;
+    count = 0;
     for (int i = 0; i < n; i++) {
         double u = (first + (double)i) * scale, b = b0 + b1 * u;
         count += (b < 0.0) & (b * b > k * (u * u + w));
@@ -11767,10 +11782,8 @@ static void disti_render_task(void *arg, int index, int worker)
         if (job->least) disti_silhouette(tracer, worker, &tile, &bench);
         else if (job->tape && job->tape->value) disti_warm_seed(&tile, &bench);
     }
-    disti_render_planes(job, &tile, &bench);
+    disti_render_planes(job, worker, &tile, &bench);
     if (tile.lazy) bench.stats->rays_in_sphere = met; /* planes counts only those that were made */
-    if (job->out->normal) disti_render_normals(job, worker, &tile, &bench);
-    if (job->out->color) disti_render_colors(job, worker, &tile, &bench);
 }
 
 /* Pixels that stand alone have no neighbors to share cones and predictions with: their rays, and no others, are packed
@@ -11829,9 +11842,7 @@ static void disti_render_list_task(void *arg, int index, int worker)
         disti_trace_all(tracer, worker, &bench, (size_t)tile.width);
         disti_trace_end(tracer, &bench, (size_t)tile.width);
         tile.own_width = tile.width;
-        disti_render_planes(job, &tile, &bench);
-        if (job->out->normal) disti_render_normals(job, worker, &tile, &bench);
-        if (job->out->color) disti_render_colors(job, worker, &tile, &bench);
+        disti_render_planes(job, worker, &tile, &bench);
     }
 }
 

@@ -8296,6 +8296,12 @@ static float disti_ray_epsilon(const disti_tracer *tracer, const disti_ray *ray,
     return DISTI_MAX(epsilon, tracer->noise);
 }
 
+/* |f| from which on the ray feels its way: a coarse epsilon says how exact a hit is to be, not what may be passed by. */
+static float disti_ray_near(const disti_tracer *tracer, const disti_ray *ray, float s)
+{
+    return DISTI_MIN(disti_ray_epsilon(tracer, ray, s), DISTI_MAX(5e-4f * tracer->detail, tracer->noise));
+}
+
 static int disti_ray_end(disti_ray *ray, int status, float s, float f, float error)
 {
     ray->status = (unsigned char)status;
@@ -8371,10 +8377,10 @@ static int disti_ray_bracketed(const disti_tracer *tracer, disti_ray *ray, float
     float slope = inside ? slope_a : slope_b;
     float other = inside ? slope_b : slope_a;
     float magnitude = f < 0.0f ? -f : f;
-    float flatter = DISTI_MIN(slope, other > 0.0f ? other : -other);
+    float aside = other > 0.0f ? other : -other, flatter = DISTI_MIN(slope, aside);
     if (slope > 1e-3f && magnitude <= tolerance * DISTI_MIN(0.5f * slope, flatter)) {
         ray->slope = -slope;
-        float width = ray->b - ray->a, off = magnitude + tracer->noise;
+        float width = ray->b - ray->a, off = magnitude * (DISTI_MAX(slope, aside) / flatter) + tracer->noise;
         float error = disti_ray_kink(tracer, ray, flatter);
         return disti_ray_end(ray, DIST_RAY_HIT, ray->q + f / slope, 0.0f,
                              DISTI_MAX(error, off < width * flatter ? off / flatter : width));
@@ -8419,7 +8425,7 @@ static float disti_ray_floor(const disti_tracer *tracer, const disti_ray *ray)
 static int disti_ray_step(const disti_tracer *tracer, disti_ray *ray)
 {
     float radius = disti_empty(tracer, ray->f);
-    float epsilon = disti_ray_epsilon(tracer, ray, ray->s);
+    float epsilon = disti_ray_near(tracer, ray, ray->s);
     float slope = ray->slope / tracer->lipschitz;
     if (ray->fb < 0.0f && ray->s + radius >= ray->b) /* not Lipschitz after all */
         return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->b, ray->fb);
@@ -8478,19 +8484,21 @@ static int disti_ray_feel(const disti_tracer *tracer, disti_ray *ray, float epsi
 /* Past the least f of the band, which lies between a and b, at s as far as is known; f is not negative at all three.
    Where it is convex it stays above its chords continued: as soon as these stay above 0, the ray only came near. Until
    then, or until f < 0, it is looked for in turn where two equal slopes meet, where a parabola is least, and by golden
-   sections. A steep least f below half of epsilon may be a sheet that is thinner than floats can tell: a hit. Where the
-   sides are flat, a least f says nothing, float noise has many: the ray goes on. */
+   sections. A steep least f below half of epsilon may be a sheet that is thinner than floats can tell: a hit; a coarser
+   epsilon than the default makes none of what passes by. Where the sides are flat, a least f says nothing, float noise
+   has many: the ray goes on. */
 static int disti_ray_least(const disti_tracer *tracer, disti_ray *ray)
 {
     float before = ray->s - ray->a, after = ray->b - ray->s;
     float left = (ray->fa - ray->f) / before, right = (ray->fb - ray->f) / after;
     float drop = DISTI_MAX(right * before, left * after);
     int spent = ray->moved > 12 || ray->b - ray->a < 4e-6f * tracer->field->radius;
-    float epsilon = disti_ray_epsilon(tracer, ray, ray->s);
+    float epsilon = disti_ray_near(tracer, ray, ray->s);
     int flat = DISTI_MAX(ray->fa, ray->fb) - ray->f < tracer->noise;
     float gentler = DISTI_MIN(left, right);
-    int narrow = gentler > 0.3f * tracer->lipschitz || (gentler > 0.0f && !flat && ray->b - ray->a < epsilon);
-    int sheet = narrow && ray->f < 0.5f * epsilon; /* too thin to be sure of */
+    float thin = DISTI_MIN(epsilon, DISTI_MAX(5e-5f * tracer->detail, tracer->noise));
+    int narrow = gentler > 0.3f * tracer->lipschitz || (gentler > 0.0f && !flat && ray->b - ray->a < thin);
+    int sheet = narrow && ray->f < 0.5f * thin; /* too thin to be sure of */
     if (spent || drop < ray->f) {
         ray->slope = -left;
         if (sheet || (!flat && ray->f <= tracer->noise))
@@ -8544,7 +8552,7 @@ static int disti_ray_leasted(const disti_tracer *tracer, disti_ray *ray, float f
    band's first sample stands in a, fa, the last but one in b, fb. */
 static int disti_ray_band(const disti_tracer *tracer, disti_ray *ray, float f)
 {
-    float epsilon = disti_ray_epsilon(tracer, ray, ray->s);
+    float epsilon = disti_ray_near(tracer, ray, ray->s);
     float slope = (f - ray->f) / DISTI_MAX(ray->q - ray->s, 1e-30f);
     if (f <= 0.0f && ray->f > 0.0f) return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->q, f);
     if (f < 0.0f)
@@ -8745,10 +8753,10 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
         break;
     }
     }
-    if (ray->f < disti_ray_epsilon(tracer, ray, ray->s)) {
+    if (ray->f < disti_ray_near(tracer, ray, ray->s)) {
         if (ray->fb < 0.0f && ray->b > ray->s)
             return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->b, ray->fb);
-        float epsilon = disti_ray_epsilon(tracer, ray, ray->s);
+        float epsilon = disti_ray_near(tracer, ray, ray->s);
         ray->side = 0;
         ray->moved = ray->slope < 0.0f; /* came down to here from farther out: from a, or where f was epsilon */
         ray->b = ray->fa > 0.0f ? ray->a : ray->s;

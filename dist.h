@@ -590,8 +590,9 @@ typedef struct dist_images {
     unsigned char *mask;   /* 1 hit, 0 not: the authority */
     unsigned char *status; /* DIST_RAY_* */
     float *error;          /* bound on the error of distance, as good as f's slopes are sampled; 0 where that is the
-                              background. Behind the edge of a nearer surface it reaches to that, but with
-                              how.certified. DIST_TRACE_PAPER: |f| of a hit's sample, no bound */
+                              background. Behind the edge of a nearer surface it reaches to that; with
+                              how.certified only where a slope beyond the Lipschitz figure was met in the same tile.
+                              DIST_TRACE_PAPER: |f| of a hit's sample, no bound */
     dist_stats *stats;
 } dist_images;
 
@@ -8296,7 +8297,13 @@ static float disti_ray_epsilon(const disti_tracer *tracer, const disti_ray *ray,
     return DISTI_MAX(epsilon, tracer->noise);
 }
 
-/* |f| from which on the ray feels its way: a coarse epsilon says how exact a hit is to be, not what may be passed by. */
+/* Whether an epsilon is so much larger than the default that over the lengths it allows slopes may differ by twice. */
+static int disti_coarse(const disti_tracer *tracer, float epsilon)
+{
+    return epsilon > 2e-3f * tracer->detail;
+}
+
+/* |f| from which on the ray feels its way: a coarse epsilon says how exact a hit is to be, not what may be passed. */
 static float disti_ray_near(const disti_tracer *tracer, const disti_ray *ray, float s)
 {
     return DISTI_MIN(disti_ray_epsilon(tracer, ray, s), DISTI_MAX(5e-4f * tracer->detail, tracer->noise));
@@ -8334,12 +8341,15 @@ static int disti_ray_ask(disti_ray *ray, int mode, float q)
 }
 
 /* How far before a hit the surface may be for a ray that came down steeply, but crosses 0 slowly, by `falls`: between
-   the two f bends, and where it is as flat as that, ripples of the surface's |f| may have crossed 0 before. */
+   the two f bends, and where it is as flat as that, ripples of the surface's |f| may have crossed 0 before. Over a
+   bracket that is flat from the start they may have done so anywhere in it. No less than what f's noise hides. */
 static float disti_ray_kink(const disti_tracer *tracer, const disti_ray *ray, float falls)
 {
-    float flat = 6.0f * disti_ray_epsilon(tracer, ray, ray->a), most = 0.02f * tracer->field->radius;
-    if (!(falls < 0.12f * tracer->lipschitz && ray->incline < -4.0f * falls)) return 0.0f;
-    return flat < most * falls ? flat / falls : most;
+    float most = 0.02f * tracer->field->radius, flat = tracer->noise;
+    if (falls < 0.15f * tracer->lipschitz && ray->incline < -2.0f * falls)
+        flat = 12.0f * disti_ray_epsilon(tracer, ray, ray->a);
+    flat = flat < most * falls ? flat / falls : most;
+    return ray->incline > -0.12f * tracer->lipschitz ? DISTI_MAX(flat, DISTI_MIN(ray->width, most)) : flat;
 }
 
 /* Bracket [a, b], fa > 0 >= fb, finished by ITP (Oliveira and Takahashi 2020): regula falsi, pushed a little toward the
@@ -8351,8 +8361,15 @@ static int disti_ray_bracket(const disti_tracer *tracer, disti_ray *ray)
     float epsilon = DISTI_MAX(disti_ray_epsilon(tracer, ray, ray->a), 2.4e-7f * tracer->field->radius);
     float q = ray->fa > ray->fb ? ray->a + width * (ray->fa / (ray->fa - ray->fb)) : middle; /* both may be 0 */
     if (width <= epsilon) {
-        ray->slope = (ray->fb - ray->fa) / width;
-        return disti_ray_end(ray, DIST_RAY_HIT, q, 0.0f, DISTI_MAX(width, disti_ray_kink(tracer, ray, -ray->slope)));
+        float falls = (ray->fa - ray->fb) / width, before = -ray->slope, error = width;
+        if (disti_coarse(tracer, epsilon) && ray->side == 0 && before > 0.0f && falls > 0.0f) {
+            /* as below: no farther than |f| takes from an end, where two slopes in a row are alike */
+            float flatter = DISTI_MIN(falls, before), uneven = DISTI_MAX(falls, before) / flatter;
+            float off = 2.0f * DISTI_MIN(ray->fa, -ray->fb) * uneven * uneven + tracer->noise;
+            if (off < width * flatter) error = DISTI_MAX(off / flatter, 0.2f * width);
+        }
+        ray->slope = -falls;
+        return disti_ray_end(ray, DIST_RAY_HIT, q, 0.0f, DISTI_MAX(error, disti_ray_kink(tracer, ray, falls)));
     }
     float room = epsilon; /* how far from the middle q may lie: what bisection would have left, less half the width */
     while (room < ray->width) room *= 2.0f;
@@ -8381,6 +8398,7 @@ static int disti_ray_bracketed(const disti_tracer *tracer, disti_ray *ray, float
     if (slope > 1e-3f && magnitude <= tolerance * DISTI_MIN(0.5f * slope, flatter)) {
         ray->slope = -slope;
         float width = ray->b - ray->a, off = magnitude * (DISTI_MAX(slope, aside) / flatter) + tracer->noise;
+        if (disti_coarse(tracer, 4.0f * tolerance)) off += off;
         float error = disti_ray_kink(tracer, ray, flatter);
         return disti_ray_end(ray, DIST_RAY_HIT, ray->q + f / slope, 0.0f,
                              DISTI_MAX(error, off < width * flatter ? off / flatter : width));
@@ -8639,7 +8657,8 @@ static int disti_ray_predicted(const disti_tracer *tracer, disti_ray *ray, float
         if (length > 0.125f * (float)(ray->base + (double)ray->q) * ray->footprint) ray->own = 0; /* of a pixel: 1/16 */
         ray->off = DISTI_MAX(off < 0.0f ? -off : off, 1e-9f);
         /* short of the surface nothing tells whether f flattens on the way, most likely where it is flat already */
-        float factor = f > 0.0f && slope > -0.6f * tracer->lipschitz ? 10.0f : 2.0f;
+        float factor = disti_coarse(tracer, epsilon) ? 3.0f : 2.0f;
+        if (f > 0.0f && slope > -0.6f * tracer->lipschitz) factor = 10.0f;
         return disti_ray_end(ray, DIST_RAY_HIT, ray->q + step, f, factor * length - tracer->noise / slope);
     }
     if (!good || ray->q + step <= (fronted ? ray->s : ray->start) || ray->q + step >= ray->leave) {
@@ -11777,12 +11796,15 @@ static void disti_render_task(void *arg, int index, int worker)
         }
         budget.marching = 1;
         for (int i = 0; i < n && job->tape; i++) bench.rays[i].stop = bench.rays[i].start;
+        float steepest = bench.stats->steepest;
+        bench.stats->steepest = 0.0f;
         if (job->warm) bench.cones = 0; /* its memory is put to another use */
         if (job->warm) disti_render_warm(job, worker, &tile, &bench);
         if (job->predict) disti_trace_lattice(tracer, worker, &tile, &bench);
         else disti_trace_all(tracer, worker, &bench, (size_t)n);
-        if (!tracer->how.certified && (job->out->error || job->out->stats))
-            disti_trace_doubt(tracer, &tile, &bench);
+        int proven = tracer->how.certified && !(bench.stats->steepest > 0.0f);
+        bench.stats->steepest = DISTI_MAX(bench.stats->steepest, steepest);
+        if (!proven && (job->out->error || job->out->stats)) disti_trace_doubt(tracer, &tile, &bench);
         budget.marching = 0;
         disti_tile_trim(job, &tile, &bench);
         disti_trace_end(tracer, &bench, (size_t)(tile.width * tile.height));

@@ -1040,12 +1040,13 @@ static int bound_side(void)
 
 /* picture_a is traced and compared with picture_b, the truth: of the hits that are also the truth's, 999 of 1000 at
    least must be off by no more than their error and the truth's together. Hits where the truth has none are false, and
-   at most 1 in 1000, like those of which the truth is not known. */
-static void bound_check(dist_context *ctx, const char *name, const dist_field *field, const dist_camera *camera)
+   at most 1 in 1000, like those of which the truth is not known. With a `how` of its own: 998, and 2 in 1000. */
+static void bound_check(dist_context *ctx, const char *name, const dist_field *field, const dist_camera *camera,
+                        const dist_render_desc *how)
 {
     int hits = 0, held = 0, both = 0, phantom = 0, unknown = 0;
     double worst = 0;
-    CHECK_STATUS(DIST_OK, picture_render(ctx, field, camera, NULL, &picture_a), ctx);
+    CHECK_STATUS(DIST_OK, picture_render(ctx, field, camera, how, &picture_a), ctx);
     for (int i = 0; i < camera->width * camera->height; i++) {
         if (!picture_a.mask[i]) continue;
         hits++;
@@ -1060,7 +1061,7 @@ static void bound_check(dist_context *ctx, const char *name, const dist_field *f
         held += over <= 0;
         worst = fmax(worst, over);
     }
-    int good = CHECK(both > 0) & CHECK(held >= 0.999 * both) & CHECK(phantom * 1000 <= hits) &
+    int good = CHECK(both > 0) & CHECK(held >= (how ? 0.998 : 0.999) * both) & CHECK(phantom * 1000 <= (how ? 2 : 1) * hits) &
                CHECK(unknown <= 2 + hits / 1000); /* flat at float noise */
     if (!good || test_state.verbose)
         printf("    %s: hits %d, within the bound %.3f %%, beyond it by %.1e at most, false %d, truth unknown %d\n",
@@ -1082,10 +1083,10 @@ static void bound_check_shape(dist_context *ctx, const char *name, const shape_c
         picture_b.distance[i] = (float)cross.t;
         picture_b.error[i] = 1.2e-7f * (float)cross.t; /* of rounding to float */
     }
-    bound_check(ctx, name, &field, camera);
+    bound_check(ctx, name, &field, camera, NULL);
     unsigned long long hits = picture_a.stats.hits, cones = picture_a.stats.cone_queries;
     field.cost = 1; /* smaller cones along the outline, but no balls */
-    bound_check(ctx, name, &field, camera);
+    bound_check(ctx, name, &field, camera, NULL);
     CHECK(picture_a.stats.cone_queries > cones || camera->width < 256);
     CHECK(picture_a.stats.hits + hits / 1000 >= hits && picture_a.stats.hits <= hits + hits / 1000);
     field.cost = -1;
@@ -1095,7 +1096,7 @@ static void bound_check_shape(dist_context *ctx, const char *name, const shape_c
 
 /* The truth is a certified picture to 1e-7 with twice the sampled slopes, which alone are no bounds: with them, too,
    nearer surfaces are passed. */
-static void bound_check_decoder(dist_context *ctx, const char *path, int code)
+static void bound_check_decoder(dist_context *ctx, const char *path, int code, int coarse)
 {
     char name[96];
     dist_camera camera = shape_camera(bound_side(), bound_side());
@@ -1112,7 +1113,10 @@ static void bound_check_decoder(dist_context *ctx, const char *path, int code)
         steep.lipschitz *= 2.0f;
         steep.lipschitz_far *= 2.0f;
         CHECK_STATUS(DIST_OK, picture_render(ctx, &steep, &camera, &how, &picture_b), ctx);
-        bound_check(ctx, name, &field, &camera);
+        bound_check(ctx, name, &field, &camera, NULL);
+        how.certified = how.max_steps = 0;
+        how.epsilon = 1e-2f; /* what comes near without a crossing is no hit for that */
+        if (coarse) bound_check(ctx, name, &field, &camera, &how);
     }
     dist_shape_destroy(shape);
     dist_net_destroy(net);
@@ -1196,7 +1200,7 @@ TEST(error_bounds_hold_for_999_hits_of_1000)
     bound_check_shape(ctx, "torus of slope 2", &cases[4], &camera);
     bound_check_shape(ctx, "torus clamped at 0.1", &cases[5], &camera);
     bound_check_shape(ctx, "bumps", &cases[6], &camera);
-    for (int code = 0; code < 4; code++) bound_check_decoder(ctx, "examples/model.safetensors", 65 * code);
+    for (int code = 0; code < 4; code++) bound_check_decoder(ctx, "examples/model.safetensors", 65 * code, 1);
     dist_context_destroy(ctx);
 }
 
@@ -1216,7 +1220,7 @@ TEST(error_bounds_hold_for_999_hits_of_1000_of_real_decoders)
             continue;
         }
         (void)snprintf(file, sizeof file, "nets/%.*s.safetensors", dot ? (int)(dot - names[k]) : 31, names[k]);
-        bound_check_decoder(ctx, test_data_path(file), dot ? atoi(dot + 1) : -1);
+        bound_check_decoder(ctx, test_data_path(file), dot ? atoi(dot + 1) : -1, names[k][0] != 'm'); /* m: flat */
     }
     dist_context_destroy(ctx);
 }

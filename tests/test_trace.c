@@ -1061,7 +1061,8 @@ static void bound_check(dist_context *ctx, const char *name, const dist_field *f
         held += over <= 0;
         worst = fmax(worst, over);
     }
-    int good = CHECK(both > 0) & CHECK(held >= (how ? 0.998 : 0.999) * both) & CHECK(phantom * 1000 <= (how ? 2 : 1) * hits) &
+    int beyond = how ? 2 : 1; /* in 1000 */
+    int good = CHECK(both > 0) & CHECK(held >= (1 - 0.001 * beyond) * both) & CHECK(phantom * 1000 <= beyond * hits) &
                CHECK(unknown <= 2 + hits / 1000); /* flat at float noise */
     if (!good || test_state.verbose)
         printf("    %s: hits %d, within the bound %.3f %%, beyond it by %.1e at most, false %d, truth unknown %d\n",

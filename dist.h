@@ -9171,8 +9171,10 @@ static void disti_trace_end(const disti_tracer *tracer, const disti_bench *bench
         disti_ray *ray = &bench->rays[i];
         if (ray->mode != DISTI_DONE) disti_ray_give_up(ray);
         if (!disti_ray_is_hit(tracer, ray)) continue; /* one without a query of its own may find nothing left for it */
-        if (++hits * bench->budget->per_hit > bench->budget->left) ray->status = DIST_RAY_UNRESOLVED;
+        if ((hits + 1) * bench->budget->per_hit > bench->budget->left) ray->status = DIST_RAY_UNRESOLVED;
+        else hits++;
     }
+    if (bench->budget) bench->budget->hits = hits;
 }
 
 static void disti_stats_begin(dist_context *ctx)
@@ -10330,7 +10332,8 @@ static float disti_clamp(float f, float limit)
     return f > limit ? limit : f < -limit ? -limit : f;
 }
 
-/* One query's worth of marching. ray->s: t; f: last f; a: first f of the finest level; fa: smallest |f| there. */
+/* One query's worth of marching. ray->s: t; f: last f; a: first f of the finest level; fa: smallest |f| there; moved: 1
+   if one was not finite. */
 static void disti_paper_step(const disti_tracer *tracer, disti_ray *ray, float *samples, float alpha, float f,
                              const float *p)
 {
@@ -10339,6 +10342,7 @@ static void disti_paper_step(const disti_tracer *tracer, disti_ray *ray, float *
     if (samples) disti_paper_keep(samples, tracer->how.samples, f, p);
     if (ray->steps == 0) ray->a = f;
     if (ray->steps == 0 || magnitude < ray->fa) ray->fa = magnitude;
+    if (!disti_finite(f)) ray->moved = 1;
     ray->f = f;
     ray->s += alpha * disti_clamp(f, 0.1f * tracer->field->radius);
     ray->steps++;
@@ -10411,7 +10415,7 @@ static void disti_paper_finish(const disti_tracer *tracer, disti_ray *ray)
     }
     ray->mode = DISTI_DONE;
     ray->status = DIST_RAY_MISS;
-    if (!disti_finite(ray->f)) ray->status = DIST_RAY_NOT_FINITE;
+    if (ray->moved) ray->status = DIST_RAY_NOT_FINITE;
     else if (before && ray->fa <= epsilon && first) ray->status = DIST_RAY_HIT;
     else if (before && !first && ray->a < 0.0f) ray->status = DIST_RAY_INSIDE;
     else if (before) ray->status = DIST_RAY_UNRESOLVED;
@@ -11488,8 +11492,17 @@ static int disti_warm_take(disti_warm *warm, int i, float f)
     disti_stats_slope(warm->tracer, ray, f, bench->stats);
     if (disti_ray_advance(warm->tracer, ray, f)) return 1;
     bench->depth[i] = disti_hit_depth(ray);
-    if (bench->budget) bench->budget->hits += (unsigned)disti_ray_is_hit(warm->tracer, ray);
     return 0;
+}
+
+/* What the hits so far, most of them without a query, owe of the budget. */
+static void disti_warm_owe(const disti_warm *warm)
+{
+    const disti_bench *bench = warm->bench;
+    if (!bench->budget) return;
+    bench->budget->hits = 0;
+    for (int i = 0; i < warm->n; i++)
+        bench->budget->hits += (unsigned)disti_ray_is_hit(warm->tracer, &bench->rays[i]);
 }
 
 /* Whether the next two samples of ray i, on both sides of the lowest one, are asked for at once. */
@@ -11505,6 +11518,7 @@ static void disti_warm_rounds(disti_warm *warm, int all)
     const disti_bench *bench = warm->bench;
     while (all ? warm->count > 0 : warm->awaited > 0) {
         size_t count = warm->count, points = 0, at = 0;
+        disti_warm_owe(warm);
         int pairs = 2 * count <= (size_t)DISTI_TILE_RAYS, each;
         for (size_t k = 0; k < count; k++) {
             const disti_ray *ray = &bench->rays[bench->index[k]];
@@ -11632,6 +11646,7 @@ static void disti_render_warm(const disti_render_job *job, int worker, const dis
         warm.count = 0;
         if (good) disti_warm_doubt(&warm);
     } while (warm.count > 0);
+    disti_warm_owe(&warm);
 }
 
 /* Misses that were traced have no sample where |f| is least,

@@ -603,11 +603,12 @@ typedef struct dist_tape dist_tape;
    with warm_start then verifies the last picture's hits and near misses, one query each or none, instead of marching.
    It is meant for an optimization that moves the surface by less than about a pixel a step. Whatever does not
    verify, and every tile in which much has moved, is traced anew; so is the whole picture after a change of camera, of
-   field (the shape itself may get a new code) or of epsilon. What is certain: every hit lies on the surface within its
-   error bound, and what lies before the cones' stops (blocks of 8 x 8 pixels) is empty as far as the Lipschitz figure
-   is right, as in a cold render. Between there and the hit a surface that comes out of nothing is noticed at once if f
-   where the cones stop betrays it, else by the rays that are marched anew in turn: after 128 renders at the latest
-   (64 for pixels that were misses). */
+   field (the shape itself may get a new code) or of epsilon. What is certain: what lies before the cones' stops (blocks
+   of 8 x 8 pixels) is empty as far as the Lipschitz figure is right, as in a cold render. Every hit lies on the surface
+   within its error bound, but those without a query, moved as their neighbors are and asked within 16 renders, only
+   where neighbors see alike: not where the surface has bumps finer than two pixels. Between the cones' stop and the
+   hit a surface that comes out of nothing is noticed at once if f where the cones stop betrays it, else by the rays
+   that are marched anew in turn: after 128 renders at the latest (64 for pixels that were misses). */
 DIST_API dist_tape *dist_tape_create(dist_context *ctx, const dist_camera *camera, const dist_render_desc *desc);
 DIST_API void dist_tape_destroy(dist_tape *tape);
 

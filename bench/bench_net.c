@@ -6,12 +6,13 @@
    units are zero and left out; its rate counts what a dense net would do. backward: value and gradient at the point;
    backward_code: that and the code's gradient. Beside a real decoder are all_alive, all_alive_backward and
    all_alive_backward_code: a net of the same layers without a dead unit at the same points; of_alive is a mode's time
-   over that net's, reverse_of_alive the same of what backward takes more than the forward pass. f16, bf16, and f16_dead, bf16_dead: the hidden layers in 16 bits, where
-   the processor has the instructions, against the peak of those; max_error and rms_error are against f32. gflops counts
-   the forward pass alone in all modes; of_forward is the time in f32 forward passes; executed is the share of the
-   forward multiply-adds that was done. speedup, in f32 rows of several threads: their rate over that of one thread,
-   and peak_speedup the same of the peak loop, which says what the machine gives; one thread and all of them take turns,
-   by the clock, the fastest of each, since what else runs costs several threads more than one; 0 in other rows. */
+   over that net's, reverse_of_alive the same of what backward takes more than the forward pass. f16, bf16, and
+   f16_dead, bf16_dead: the hidden layers in 16 bits, where the processor has the instructions, against the peak of
+   those; max_error and rms_error are against f32. gflops counts the forward pass alone in all modes; of_forward is the
+   time in f32 forward passes; executed is the share of the forward multiply-adds that was done. speedup, in f32 rows
+   of several threads: their rate over that of one thread, and peak_speedup the same of the peak loop, which says what
+   the machine gives; one thread and all of them take turns, by the clock, the fastest of each, since what else runs
+   costs several threads more than one; 0 in other rows. */
 #define DIST_IMPLEMENTATION
 #include "../dist.h"
 #include "../examples/common.h"

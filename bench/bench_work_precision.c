@@ -6,8 +6,8 @@
    dist_field_eval's; the hit is then moved to the root of the network in double (exact.h), its normal and the smallest
    |f| beside the outline are in double. The steps are those that the true slope proves (2.6 for networks), but at
    least 1e-5 (networks: 5e-5). Of pictures larger than 256 x 256 (slow decoders, without --long: 128 x 128) as many
-   pixels, spread evenly, are compared, and counted, and have a share in the gradient (`pixels_compared`). Wrong pixels are counted against the surface itself,
-   not against its epsilon:
+   pixels, spread evenly, are compared, and counted, and have a share in the gradient (`pixels_compared`). Wrong pixels
+   are counted against the surface itself, not against its epsilon:
        hole        the ray goes in by more than CLEAR, and mask is 0
        false hit   mask is 1, and the ray keeps farther than CLEAR from the surface; or misses the bounding sphere
    Errors are those of the distance at the pixels that are hit in both; a bound is violated where the error is larger
@@ -26,10 +26,10 @@
    and _bf16 take field.coarse_fn for everything (dist_net_set_half): the bound is then one of the field in 16 bits and
    knows nothing of its rounding. Where the processor has none of it the row says "not available".
 
-   --minutes bounds what a case's size takes beside its reference: the rows come in order of importance, defaults first.
-   One is made with fewer runs (column `runs`) if 7 would take more than an eighth of the time (at a size without
-   sweeps, but of slow decoders: a third), and is left out, with a word on stderr, where one would, or where no time is left; but not the
-   defaults of guarded, certified and the paper's two fastest rows.
+   --minutes bounds what a case's size takes beside its reference: the rows come in order of importance, defaults
+   first. One is made with fewer runs (column `runs`) if 7 would take more than an eighth of the time (at a size
+   without sweeps, but of slow decoders: a third), and is left out, with a word on stderr, where one would, or where no
+   time is left; but not the defaults of guarded, certified and the paper's two fastest rows.
 
    --svg draws each case and size. Lines join the epsilons of one method, or its alphas or budgets of steps; the larger
    markers are the defaults. A marker is open where the picture failed: more than 1 in 1000 pixels that should be hit is

@@ -274,7 +274,7 @@ def main():
     global torch
     import torch
     torch.set_num_threads(o.threads)
-    out = csv.writer(sys.stdout)
+    out = csv.writer(sys.stdout, lineterminator="\n")
     print(f"# PyTorch {torch.__version__}, {o.threads} threads"
           + (f"; {torch.cuda.get_device_name()}" if torch.cuda.is_available() and not o.no_gpu else ""))
     out.writerow("case,method,device,resolution,threads,seconds,forward,backward,queries,hits,times".split(","))

@@ -294,8 +294,8 @@ static void probe_exactly(const prober *p, size_t n, const ray *rays, double *sd
     if (p->s->net) { exact_eval(p->e, n, p->at, sdf, slopes ? p->gradient : NULL, NULL); }
 }
 
-/* One pixel of each square of a picture that has more than `most` along a side, chosen by chance: not those that the tracer
-   treats in a way of their own. */
+/* One pixel of each square of a picture that has more than `most` along a side, chosen by chance: not those that the
+   tracer treats in a way of their own. */
 static int is_compared(const dist_camera *camera, unsigned most, int i)
 {
     unsigned side = ((unsigned)camera->width + most - 1) / most;

@@ -92,8 +92,8 @@ static inline void exact_encode(const exact *e, const double *points, double *d_
     }
 }
 
-/* y += scale * w x for `count` columns of one row of weights; backward: d_x += scale * w^T delta. What stays the same in
-   the loop is copied, since it might overlap the rest for all that a compiler knows. */
+/* y += scale * w x for `count` columns of one row of weights; backward: d_x += scale * w^T delta. What stays the same
+   in the loop is copied, since it might overlap the rest for all that a compiler knows. */
 static inline void exact_row(const float *w, int count, double scale, const double *x, double *y)
 {
     double sum[EXACT_BLOCK];

@@ -4169,6 +4169,11 @@ static dist_status disti_scene_place(dist_scene *scene, int k, const dist_instan
         return disti_fail(ctx, DIST_BAD_ARGUMENT,
                           "%s: placement.scale is %d: the bounding sphere's radius is %d, must be 1e-15 to 1e15",
                           function, (double)next.scale, (double)ball.radius);
+    for (int i = 0; i < 3; i++)
+        if (!(fabsf(ball.center[i]) <= DISTI_RADIUS_MOST))
+            return disti_fail(ctx, DIST_BAD_ARGUMENT,
+                              "%s: placement.translation puts the bounding sphere's center at %d on axis %d; must be "
+                              "within 1e15 of 0", function, (double)ball.center[i], (double)i);
     *placed = next;
     scene->ball[k] = ball;
     return DIST_OK;

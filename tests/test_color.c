@@ -694,6 +694,10 @@ TEST(a_texture_that_does_not_fit_and_gradients_that_are_not_there_are_refused)
     CHECK_STATUS(DIST_BAD_ARGUMENT, dist_color_backward(s.ctx, &s.field, 1, x, NULL, NULL, &grads), s.ctx);
     CHECK_TEXT("dist_color_backward: d_color is NULL", dist_context_message(s.ctx));
     dist_context_clear(s.ctx);
+    size_t most = (size_t)-1;
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_color_backward(s.ctx, &s.field, most, x, x, NULL, &grads), s.ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_color_eval(s.ctx, &s.field, most, x, x), s.ctx);
+    CHECK_STATUS(DIST_OK, dist_color_eval(s.ctx, &s.field, 0, NULL, NULL), s.ctx);
     grads.weights = weights;
     CHECK_STATUS(DIST_UNSUPPORTED, dist_color_backward(s.ctx, &s.field, 1, x, x, NULL, &grads), s.ctx); /* weights */
     CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_backward(s.ctx, &s.field, 1, x, x, NULL, NULL, NULL, &grads), s.ctx);

@@ -1050,6 +1050,9 @@ TEST(scenes_refuse_what_cannot_be_placed)
     x = good;
     memcpy(&x.placement.translation[1], &bits, sizeof bits);
     refused(ctx, &x, "must be finite");
+    x = good;
+    x.placement.translation[1] = -1e30f;
+    refused(ctx, &x, "at -1e30 on axis 1; must be within 1e15");
     dist_scene *scene = dist_scene_create(ctx, 1, &good);
     REQUIRE(scene != NULL);
     x = good;

@@ -26,39 +26,44 @@
    and _bf16 take field.coarse_fn for everything (dist_net_set_half): the bound is then one of the field in 16 bits and
    knows nothing of its rounding. Where the processor has none of it the row says "not available".
 
-   --minutes bounds what a case's size takes beside its reference: the rows come in order of importance, defaults
-   first. One is made with fewer runs (column `runs`) if 7 would take more than an eighth of the time (at a size
-   without sweeps, but of slow decoders: a third), and is left out, with a word on stderr, where one would, or where no
-   time is left; but not the defaults of guarded, certified and the paper's two fastest rows.
+   --minutes bounds what a case's size takes beside its reference: the rows come in order of importance (`plan`), which
+   is the csv's. One that takes more than a 40th of the time with 7 runs is made with fewer (column `runs`; the defaults
+   of the first four methods: more than an 8th); one that takes more than an 8th with a single run (of a slow decoder: a
+   third), or more than is left, is left out, with a word on stderr; but never the defaults of guarded, certified and the
+   paper's two fastest rows (of slow decoders beyond 256 x 256: of guarded). "done" on stderr tells what a size took.
 
    --svg draws each case and size. Lines join the epsilons of one method, or its alphas or budgets of steps; the larger
    markers are the defaults. A marker is open where the picture failed: more than 1 in 1000 pixels that should be hit is
-   wrong, or as many hits of our own are farther off than their bound. STEM_losses.svg holds our default against the
-   best of all of the paper's rows, by each measure for itself: points above the line are where dist.h loses. */
+   wrong, or as many hits of our own are farther off than their bound. STEM_sizes.svg holds the epsilons of guarded and of
+   the paper's coarse-to-fine row at each size, scene by scene. STEM_losses.svg holds our default against the best of all
+   of the paper's rows, by each measure for itself: points above the line are where dist.h loses. */
 #define DIST_IMPLEMENTATION
 #include "../dist.h"
 #include "../examples/common.h"
 #include "bench.h"
 #include "exact.h"
 #include "plot.h"
+#ifdef _OPENMP
+#include <omp.h>
+#endif
 
 static const char usage[] =
     "bench_work_precision [options]\n"
     "  --case NAME        only this one\n"
-    "  --size N           only pictures of N x N (default 64, 128, 256 and 512)\n"
-    "  --largest N        pictures of 64 x 64 up to N x N (default 512)\n"
-    "  --sweep N          sweeps at N x N alone; the other sizes get the defaults, and a third of --minutes (slow\n"
-    "                     decoders: all of it)\n"
-    "  --long             also 1024, and the slow decoders (8 x 512 and with layer norm) beyond 256 x 256, with more\n"
-    "                     pixels compared; --minutes 4\n"
+    "  --list             prints the cases' names, and ends\n"
+    "  --size N           only pictures of N x N (default 64, 128, 256, 512 and 1024)\n"
+    "  --largest N        pictures of 64 x 64 up to N x N (default 1024)\n"
+    "  --long             slow decoders (8 x 512 and with layer norm) are compared at as many pixels as others\n"
     "  --minutes M        for each case and size, beside its reference (default: no bound)\n"
     "  --svg STEM         also plots, STEM_CASE_N.svg\n"
-    "  --workers N        threads (default 1: then seconds vary least)\n"
+    "  --workers N        threads of a picture (default 1: then seconds vary least)\n"
+    "  --at-once N        cases at a time, each on a core of its own, cheap ones beside slow ones; rows of one case stay\n"
+    "                     in order (default 1)\n"
     "  --quick            64 pixels, few cases and few values\n";
 
 enum { SPHERE, TORUS, BOX, RODS, BUMPS };
 #define CLEAR 2e-6
-enum { MOST_COMPARED = 256, SLOW_COMPARED = 128, SLOW_LARGEST = 256 }; /* pixels along a side */
+enum { MOST_COMPARED = 256, SLOW_COMPARED = 128, SLOW_FULL = 256 }; /* pixels along a side */
 #define NEAR 0.02
 
 typedef struct scene {
@@ -102,7 +107,7 @@ typedef struct method {
     int half;                                     /* DIST_HALF_* */
 } method;
 
-/* In order of importance: the last are the dearest. */
+/* The last are the dearest. */
 static const method methods[] = {
     {"guarded", DIST_TRACE_GUARDED, 0, 0, 0, 0, 0, 1, 1, 0, 0, 0, 0, 0, 0},
     {"certified", DIST_TRACE_GUARDED, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0},
@@ -128,7 +133,8 @@ static const method methods[] = {
     {"paper_parallel_100", DIST_TRACE_PAPER, DIST_PAPER_PARALLEL, 100, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0},
 };
 
-enum { SCENES = sizeof scenes / sizeof scenes[0], METHODS = sizeof methods / sizeof methods[0], MOST_ROWS = 32768 };
+enum { SCENES = sizeof scenes / sizeof scenes[0], METHODS = sizeof methods / sizeof methods[0] };
+enum { MOST_ROWS = 2048 }; /* of a scene */
 #define EMPTY ",,,,,,,,,,,,,,,,,,,,,,,,,,,," /* the rest of a row */
 
 /* ---- fields ------------------------------------------------------------------------------------------------------ */
@@ -735,9 +741,10 @@ static double render_once(const subject *j, const dist_render_desc *how, const d
 /* Of one row: timed, and how many the rest takes about as long as. Defaults of the first methods are never left out. */
 enum { RUNS = 7, OTHERS = 4, NEVER_LEFT_OUT = 4 };
 
-/* Renders `runs` times, fewer where all would take longer than `limit` seconds, then once more with the silhouette,
-   once with all planes to judge, and once with a gradient. */
-static row picture(const subject *j, const dist_render_desc *how, int dense, int least, int runs, double limit)
+/* Renders `runs` times, but only as often as fits `limit` seconds, then once more with the silhouette, once with all
+   planes to judge, and once with a gradient. What takes more than `most` with one run is left out: runs is 0, seconds
+   those of its only picture. */
+static row picture(const subject *j, const dist_render_desc *how, int dense, int runs, double limit, double most)
 {
     row r;
     dist_stats stats;
@@ -755,10 +762,12 @@ static row picture(const subject *j, const dist_render_desc *how, int dense, int
     if (dense && j->shape) { j->shape->all_alive = ~(uint32_t)0; }
     for (int i = 0; i < runs; i++) {
         seconds[i] = render_once(j, how, &out, tape);
-        if (i == 0 && (runs + OTHERS) * seconds[0] > limit) { runs = (int)fmax(least, limit / seconds[0] - OTHERS); }
+        if (i > 0 || (runs + OTHERS) * seconds[0] <= limit) { continue; }
+        runs = (1 + OTHERS) * seconds[0] > most ? 0 : (int)fmax(1, limit / seconds[0] - OTHERS);
     }
     r.runs = runs;
-    if (runs == 0) { /* too slow */
+    if (runs == 0) {
+        r.seconds = seconds[0];
         if (dense && j->shape) { j->shape->all_alive = all_alive; }
         dist_tape_destroy(tape);
         free(out.distance);
@@ -791,19 +800,26 @@ static row picture(const subject *j, const dist_render_desc *how, int dense, int
     return r;
 }
 
+/* A gradient's cosine and error; empty where there is none. */
+static const char *gradient_cells(char text[64], double cosine, double error)
+{
+    if (error >= 0) { snprintf(text, 64, "%.8f,%.3e", cosine, error); } else { strcpy(text, ","); }
+    return text;
+}
+
+/* In one piece, as other cases may be at it, too. */
 static void print_row(const row *r)
 {
+    char code[64], camera[64];
     double pixels = (double)r->size * (double)r->size;
     printf("%s,%s,%s,%.3g,%d,%.0f,%.4f,%.1f,%.5f,%.3e,%.3e,%.3e,%.0f,%.0f,%.4g,%.3e,%.4g,%d,%.5f,%.5f,%.0f,%.0f,%.4g,"
-           "%.0f,%.5f,%.3e,%.0f,",
+           "%.0f,%.5f,%.3e,%.0f,%s,%s,%.0f,%.5f\n",
            r->s->name, r->m->name, r->parameter, r->value, r->size, r->queries, r->queries / pixels,
            r->operations / pixels, r->seconds, r->mean, r->p99, r->largest, (double)r->holes, (double)r->false_hits,
            r->normal, r->silhouette, r->violations, r->runs, r->fastest, r->slowest, (double)r->hits,
-           (double)r->unresolved, r->touched, r->silhouette_queries, r->silhouette_seconds,
-           r->near, r->gradient_queries);
-    if (r->code_error >= 0) { printf("%.8f,%.3e,", r->code_cosine, r->code_error); } else { printf(",,"); }
-    if (r->camera_error >= 0) { printf("%.8f,%.3e,", r->camera_cosine, r->camera_error); } else { printf(",,"); }
-    printf("%.0f,%.5f\n", (double)r->compared, r->gradient_seconds);
+           (double)r->unresolved, r->touched, r->silhouette_queries, r->silhouette_seconds, r->near,
+           r->gradient_queries, gradient_cells(code, r->code_cosine, r->code_error),
+           gradient_cells(camera, r->camera_cosine, r->camera_error), (double)r->compared, r->gradient_seconds);
     fflush(stdout);
 }
 
@@ -960,14 +976,27 @@ typedef struct sweep {
     dist_camera camera;
     reference ref;
     half halves[2]; /* F16, BF16 */
-    int quick, all_slow;     /* slow scenes at all sizes, and as many pixels compared as of others */
-    int sweep_size;          /* the size at which parameters are swept; 0: each */
-    double most, end, share; /* seconds for a case's size, 0: no bound; when they are over; a row's part of them */
+    int quick, all_slow;     /* slow scenes compared at as many pixels as others */
+    double most, end;        /* seconds for a case's size, 0: no bound; when they are over */
     double seconds[METHODS]; /* of a default picture, here or, times four, of half the size; 0: not known */
     const char *svg;         /* stem of the plots' names; NULL: none */
     row *rows;
     size_t count;
+    char left_out[256]; /* what was last left out, and of which parameter's values */
 } sweep;
+
+/* Rows in order of importance: a parameter's values with the methods first..end - 1. */
+typedef struct part {
+    const char *parameter;
+    int first, end;
+} part;
+
+static const part plan[] = {
+    {"default", 0, NEVER_LEFT_OUT}, {"epsilon", 0, 1}, {"epsilon", 2, 3}, {"default", NEVER_LEFT_OUT, 12},
+    {"epsilon", 1, 2},              {"epsilon", 3, 4}, {"alpha", 0, 4},   {"steps", 0, 4},
+    {"default", 12, METHODS},       {"epsilon", 4, METHODS},
+};
+enum { PARTS = sizeof plan / sizeof plan[0] };
 
 static half half_create(dist_context *ctx, const scene *s, const float *code, int kind)
 {
@@ -1006,29 +1035,50 @@ static dist_render_desc how_of(const method *m, const char *parameter, double va
     return how;
 }
 
+/* Says what is left out, the values of one parameter on one line: value NULL ends it. */
+static void leave_out(sweep *w, const method *m, const char *parameter, const double *value)
+{
+    char head[160], *text = w->left_out;
+    snprintf(head, sizeof head, "left out: %s %d %s %s", w->subject.s->name, w->camera.width, m ? m->name : "",
+             parameter);
+    if (!value || strncmp(text, head, strlen(head)) != 0) {
+        if (*text) { fprintf(stderr, "%s\n", text); }
+        snprintf(text, sizeof w->left_out, "%s", value ? head : "");
+    }
+    size_t length = strlen(text);
+    if (value && strcmp(parameter, "default") != 0) {
+        snprintf(text + length, sizeof w->left_out - length, " %g", *value);
+    }
+}
+
 static void add_row(sweep *w, const method *m, const char *parameter, double value)
 {
     subject j = w->subject;
     double *expected = &w->seconds[m - methods];
-    double limit = w->most > 0 ? fmin(w->most / w->share, w->end - seconds_now()) : 1e30;
+    double limit = 1e30, most = 1e30;
     if (m->half) {
         half *h = &w->halves[m->half == DIST_HALF_BF16];
         j.field = &h->field;
         j.shape = h->shape;
     }
     if (w->count == MOST_ROWS) { fail("more than %d rows", MOST_ROWS); }
+    int by_default = strcmp(parameter, "default") == 0;
+    int first = by_default && m - methods < NEVER_LEFT_OUT;
+    int beyond = j.s->slow && w->camera.width > SLOW_FULL;
+    if (w->most > 0) {
+        double left = fmax(w->end - seconds_now(), 0);
+        limit = fmin(w->most / (first ? 8 : 40), left);
+        most = first && (!beyond || m == methods) ? 1e30 : fmin(w->most / (j.s->slow ? 3 : 8), left);
+    }
     dist_render_desc how = how_of(m, parameter, value);
     row r;
     memset(&r, 0, sizeof r);
-    int least = strcmp(parameter, "default") == 0 && m - methods < NEVER_LEFT_OUT;
-    if (least || *expected * (1 + OTHERS) <= limit) {
-        r = picture(&j, &how, m->dense, least, w->quick ? 3 : RUNS, limit);
-    }
+    if (*expected * (1 + OTHERS) <= most) { r = picture(&j, &how, m->dense, w->quick ? 3 : RUNS, limit, most); }
+    if (by_default && r.seconds > 0) { *expected = r.seconds; }
     if (!r.runs) {
-        fprintf(stderr, "left out: %s %d %s %s %g\n", j.s->name, w->camera.width, m->name, parameter, value);
+        leave_out(w, m, parameter, &value);
         return;
     }
-    if (strcmp(parameter, "default") == 0) { *expected = r.seconds; }
     r.s = j.s;
     r.m = m;
     r.parameter = parameter;
@@ -1038,33 +1088,34 @@ static void add_row(sweep *w, const method *m, const char *parameter, double val
     w->rows[w->count++] = r;
 }
 
-/* All methods with one parameter's values: their own defaults first, then epsilon, alpha and the budgets. The values of
-   a quick sweep are every second of all. */
-static void sweep_values(sweep *w, const char *parameter, size_t count, const double *values)
+/* One part of the plan. The values of a quick sweep are every second of all. */
+static void sweep_values(sweep *w, const part *of)
 {
-    for (size_t k = 0; k < METHODS; k++) {
+    static const double none[1] = {0};
+    int epsilon = strcmp(of->parameter, "epsilon") == 0, alpha = strcmp(of->parameter, "alpha") == 0;
+    int steps = strcmp(of->parameter, "steps") == 0;
+    const double *values = epsilon ? epsilons : alpha ? alphas : steps ? budgets : none;
+    size_t count = epsilon ? sizeof epsilons / sizeof epsilons[0] : 1;
+    count = alpha ? sizeof alphas / sizeof alphas[0] : steps ? sizeof budgets / sizeof budgets[0] : count;
+    for (int k = of->first; k < of->end; k++) {
         const method *m = &methods[k];
-        if ((values == alphas && !m->by_alpha) || (values == budgets && !m->by_steps)) { continue; }
+        if ((alpha && !m->by_alpha) || (steps && !m->by_steps)) { continue; }
         if ((m->dense || m->half) && !w->subject.shape) { continue; }
         if (m->warm && !w->subject.code_size) { continue; }
         if (m->half && !w->halves[m->half == DIST_HALF_BF16].shape) {
-            if (values == epsilons) { continue; }
+            if (epsilon) { continue; }
             printf("%s,%s,not available,,%d%s\n", w->subject.s->name, m->name, w->camera.width, EMPTY);
             continue;
         }
-        for (size_t i = 0; i < count; i += w->quick ? 2 : 1) { add_row(w, m, parameter, values[i]); }
+        for (size_t i = 0; i < count; i += w->quick ? 2 : 1) { add_row(w, m, of->parameter, values[i]); }
     }
 }
 
 /* One field at one size. */
 static void sweep_field(sweep *w, int size)
 {
-    static const double none[1] = {0};
     size_t first = w->count;
-    double most = w->most;
-    int defaults = w->sweep_size && w->sweep_size != size;
-    if (defaults && !w->subject.s->slow) { w->most = most / 3; }
-    w->share = w->most < most ? 3 : 8;
+    double start = seconds_now();
     subject *j = &w->subject;
     w->camera = camera_of(j->s, j->field, size);
     unsigned compared = j->s->slow && !w->all_slow ? SLOW_COMPARED : MOST_COMPARED;
@@ -1074,32 +1125,34 @@ static void sweep_field(sweep *w, int size)
     j->exact = (double *)take(6 + j->code_size, sizeof(double));
     j->weights = take_floats(w->ref.n);
     exact_gradient(j);
-    w->end = seconds_now() + w->most;
-    sweep_values(w, "default", 1, none);
-    if (!defaults) {
-        sweep_values(w, "epsilon", sizeof epsilons / sizeof epsilons[0], epsilons);
-        sweep_values(w, "alpha", sizeof alphas / sizeof alphas[0], alphas);
-        sweep_values(w, "steps", sizeof budgets / sizeof budgets[0], budgets);
-    }
-    w->most = most;
+    double begin = seconds_now();
+    w->end = begin + w->most;
+    for (int k = 0; k < PARTS; k++) { sweep_values(w, &plan[k]); }
+    leave_out(w, NULL, "", NULL);
     for (size_t k = 0; k < METHODS; k++) { w->seconds[k] *= 4; }
     reference_destroy(&w->ref);
     free(j->exact);
     free(j->weights);
     if (w->svg && w->count > first) { plot_rows(w->svg, w->rows + first, w->count - first); }
+    fprintf(stderr, "done %s %d: %d rows in %.1f s, and %.1f s for the reference\n", j->s->name, size,
+            (int)(w->count - first), seconds_now() - begin, begin - start);
 }
 
-static void run_scene(sweep *w, const scene *s, int only_size, int most)
+/* w: a scene's own, with its rows. */
+static void run_scene(sweep *w, const scene *s, int workers, int only_size, int largest)
 {
     scene copy;
     dist_field field;
     exact e;
     dist_shape *shape = NULL;
-    dist_context *ctx = w->subject.ctx;
+    dist_context_desc settings = {.workers = workers};
+    dist_context *ctx = w->subject.ctx = dist_context_create(&settings);
+    check(ctx);
     dist_net *net = s->net ? load_net_or_skip(ctx, s->net) : NULL;
-    if (s->net && !net) { return; }
-    memset(w->halves, 0, sizeof w->halves);
-    memset(w->seconds, 0, sizeof w->seconds);
+    if (s->net && !net) {
+        dist_context_destroy(ctx);
+        return;
+    }
     if (net) {
         const float *code = dist_net_code(net, s->code);
         if (dist_net_code_size(net) && !code) { fail("%s has no code %d", s->name, s->code); }
@@ -1117,8 +1170,7 @@ static void run_scene(sweep *w, const scene *s, int only_size, int most)
     w->subject.shape = shape;
     w->subject.e = net ? &e : NULL;
     w->subject.code_size = net ? (size_t)dist_net_code_size(net) : 0;
-    if (s->slow && !w->all_slow && most > SLOW_LARGEST) { most = SLOW_LARGEST; }
-    for (int size = only_size ? only_size : 64; size <= (only_size ? only_size : most); size *= 2) {
+    for (int size = only_size ? only_size : 64; size <= (only_size ? only_size : largest); size *= 2) {
         sweep_field(w, size);
     }
     for (int k = 0; k < 2; k++) {
@@ -1128,6 +1180,7 @@ static void run_scene(sweep *w, const scene *s, int only_size, int most)
     if (net) { exact_destroy(&e); }
     dist_shape_destroy(shape);
     dist_net_destroy(net);
+    dist_context_destroy(ctx);
 }
 
 /* ---- where it does badly ----------------------------------------------------------------------------------------- */
@@ -1231,55 +1284,135 @@ static void plot_losses(const char *stem, const row *rows, size_t n)
     if (a->n) { plot_write(&p, path_of(path, stem, "_losses.svg"), bench_origin()); }
 }
 
+/* Scene by scene, the epsilons of one row of each tracer at every size. */
+static void plot_sizes(const char *stem, const row *rows, size_t n)
+{
+    static const char *const ours[] = {"guarded", "paper_coarse_to_fine_50"};
+    static char names[2][8][48];
+    char path[PATH_SIZE];
+    const scene *of = NULL;
+    plot_panel *a = NULL;
+    plot p = plot_begin("Error against cost as pictures grow", "distance, 99 % of the hits: error over seconds; one "
+                        "thread; lines: epsilon 1e-2 to 1e-7", 4);
+    p.panel_width = 270;
+    p.panel_height = 180;
+    for (size_t i = 0; i < n; i++) {
+        const row *r = rows + i;
+        int k = strcmp(r->m->name, ours[1]) == 0, size = 0;
+        if (strcmp(r->parameter, "epsilon") != 0 || strcmp(r->m->name, ours[k]) != 0) { continue; }
+        if (r->s != of) {
+            of = r->s;
+            a = plot_add_panel(&p, of->name, "seconds", NULL, PLOT_LOG_X | PLOT_LOG_Y);
+            a->least[1] = 1e-8;
+        }
+        while (size < 7 && (64 << size) < r->size) { size++; }
+        snprintf(names[k][size], sizeof names[k][size], "%s, %d", ours[k], r->size);
+        plot_series *line = plot_series_of(a, names[k][size]);
+        line->dashed = k;
+        plot_point *q = plot_add(line, r->seconds, r->p99);
+        q->open = failed(r);
+        q->x_low = r->fastest, q->x_high = r->slowest;
+    }
+    p.open_means = "failed: more than 1 in 1000 pixels wrong, or hits of ours beyond their bound";
+    p.notes[0] = "at the low edge: no larger than told there";
+    p.notes[1] = "sizes whose time was up before are missing";
+    if (p.n) { plot_write(&p, path_of(path, stem, "_sizes.svg"), bench_origin()); }
+}
+
+/* Cases that wait: cheap ones are first in the list, slow ones last. */
+typedef struct queue {
+    int waiting[SCENES];
+    int first, end;
+} queue;
+
+/* The next case: every second thread takes them from the end, so that a slow one has a cheap one beside it; -1: none. */
+static int next_case(queue *q, int thread)
+{
+    int i = -1;
+#ifdef _OPENMP
+#pragma omp critical
+#endif
+    if (q->first < q->end) { i = thread % 2 ? q->waiting[--q->end] : q->waiting[q->first++]; }
+    return i;
+}
+
 int main(int argc, char **argv)
 {
     const char *only = NULL;
-    int only_size = 0;
-    int largest = 0;
-    dist_context_desc settings = {.workers = 1};
-    sweep w;
-    memset(&w, 0, sizeof w);
+    int only_size = 0, largest = 0, workers = 1, at_once = 1, list = 0;
+    sweep common;
+    queue cases;
+    memset(&common, 0, sizeof common);
+    memset(&cases, 0, sizeof cases);
     options o = options_begin(argc, argv, usage);
     while (option_next(&o)) {
         if (option_is(&o, "--case")) {
             only = option_text(&o);
+        } else if (option_is(&o, "--list")) {
+            list = option_flag(&o);
         } else if (option_is(&o, "--size")) {
             only_size = option_int(&o, 8, 4096);
         } else if (option_is(&o, "--largest")) {
             largest = option_int(&o, 64, 4096);
-        } else if (option_is(&o, "--sweep")) {
-            w.sweep_size = option_int(&o, 8, 4096);
         } else if (option_is(&o, "--long")) {
-            w.all_slow = option_flag(&o);
+            common.all_slow = option_flag(&o);
         } else if (option_is(&o, "--minutes")) {
-            w.most = 60 * option_number(&o, 1e-3, 1e6);
+            common.most = 60 * option_number(&o, 1e-3, 1e6);
         } else if (option_is(&o, "--svg")) {
-            w.svg = option_text(&o);
+            common.svg = option_text(&o);
         } else if (option_is(&o, "--workers")) {
-            settings.workers = option_int(&o, 1, 256);
+            workers = option_int(&o, 1, 256);
+        } else if (option_is(&o, "--at-once")) {
+            at_once = option_int(&o, 1, 256);
         } else if (option_is(&o, "--quick")) {
-            w.quick = option_flag(&o);
+            common.quick = option_flag(&o);
         } else {
             option_unknown(&o);
         }
     }
-    if (w.all_slow && !(w.most > 0)) { w.most = 240; }
-    w.subject.ctx = dist_context_create(&settings);
-    check(w.subject.ctx);
-    w.rows = (row *)take(MOST_ROWS, sizeof *w.rows);
+    if (!largest) { largest = common.quick ? 64 : 1024; }
+    for (int i = 0; i < SCENES; i++) {
+        const scene *s = &scenes[i];
+        if (list) { puts(s->name); }
+        if (only ? strcmp(only, s->name) == 0 : !common.quick || s->quick) { cases.waiting[cases.end++] = i; }
+    }
+    if (list) { return 0; }
+    if (cases.end == 0) { fail("no case is called %s: --list names them", only); }
+#ifndef _OPENMP
+    if (at_once > 1) { fputs("one case at a time: compiled without OpenMP\n", stderr); }
+#endif
+    row *rows = (row *)take((size_t)SCENES * MOST_ROWS, sizeof *rows);
+    size_t counts[SCENES] = {0}, n = 0;
     puts("case,method,parameter,value,resolution,queries,queries_per_pixel,operations_per_pixel,seconds,mean_error,"
          "p99_error,max_error,holes,false_hits,normal_p99_degrees,silhouette_mean_error,bound_violations_per_mille,"
          "runs,seconds_min,seconds_max,hits,unresolved,touched_per_mille,queries_with_silhouette,"
          "seconds_with_silhouette,silhouette_near_mean_error,gradient_queries,code_cosine,code_norm_error,"
          "camera_cosine,camera_norm_error,pixels_compared,gradient_seconds");
-    for (int i = 0; i < SCENES; i++) {
-        const scene *s = &scenes[i];
-        int wanted = only ? strcmp(only, s->name) == 0 : !w.quick || s->quick;
-        if (wanted) { run_scene(&w, s, only_size, largest ? largest : w.quick ? 64 : w.all_slow ? 1024 : 512); }
+    fflush(stdout);
+#ifdef _OPENMP
+#pragma omp parallel num_threads(at_once)
+#endif
+    {
+        int me = 0;
+#ifdef _OPENMP
+        me = omp_get_thread_num();
+#endif
+        for (int i = next_case(&cases, me); i >= 0; i = next_case(&cases, me)) {
+            sweep w = common;
+            w.rows = rows + (size_t)i * MOST_ROWS;
+            run_scene(&w, &scenes[i], workers, only_size, largest);
+            counts[i] = w.count;
+        }
     }
-    print_worst(w.rows, w.count);
-    if (w.svg) { plot_losses(w.svg, w.rows, w.count); }
-    free(w.rows);
-    dist_context_destroy(w.subject.ctx);
+    for (size_t i = 0; i < SCENES; i++) { /* together */
+        memmove(rows + n, rows + i * MOST_ROWS, counts[i] * sizeof *rows);
+        n += counts[i];
+    }
+    print_worst(rows, n);
+    if (common.svg) {
+        plot_sizes(common.svg, rows, n);
+        plot_losses(common.svg, rows, n);
+    }
+    free(rows);
     return 0;
 }

@@ -1,31 +1,73 @@
 #!/bin/sh
 # sh bench/results.sh [--quick] FOLDER PROGRAM...
 # Runs the programs that make the paper's tables and figures, and the benchmarks whose tables belong beside them, and
-# puts their sections together in FOLDER/RESULTS.md. From the root of the repository.
+# puts their sections together in FOLDER/RESULTS.md. From the root of the repository. A C compiler is enough; what else
+# is missing is left out with a sentence. If one program fails the others go on. Interrupted, or with a failure: what was
+# finished is in FOLDER and in its RESULTS.md, and a csv as far as it came in build/.
 quick=
 [ "$1" = --quick ] && quick=--quick && shift
 folder=$1
 shift
-mkdir -p "$folder" || exit 1
+mkdir -p "$folder" build || exit 1
+all_begin=$(date +%s)
+failures=
 DIST_COMMIT=$(git describe --always --dirty 2>/dev/null)
 DIST_ORIGIN=$(sh bench/machine.sh)
 export DIST_COMMIT DIST_ORIGIN
 
+# What has its section by now: the tracer first, then what is fitted with it.
+assemble() {
+    {
+        echo "# RESULTS"
+        echo
+        echo "Made by \`make results${quick:+-quick}\`; each section names its own command, the machine and the commit."
+        echo "Published numbers are of other shapes, decoders and machines."
+        first="pytorch ladder marching threshold work_precision needs code_size"
+        for name in $first; do [ -e "$folder/$name.md" ] && echo && cat "$folder/$name.md"; done
+        for file in "$folder"/*.md; do
+            name=$(basename "$file" .md)
+            case " $first RESULTS " in *" $name "*) continue ;; esac
+            echo
+            cat "$file"
+        done
+    } >"$folder/RESULTS.tmp" && mv "$folder/RESULTS.tmp" "$folder/RESULTS.md"
+}
+trap 'trap - INT TERM; assemble; echo "interrupted: $folder/RESULTS.md holds what was finished, now or before"; exit 130' \
+    INT TERM
+
+# ended NAME BEGIN STATUS: says how long it took, since when all are at it, and whether it failed.
+ended() {
+    now=$(date +%s)
+    echo "$1 took $((now - $2)) s; $(((now - all_begin) / 60)) minutes in all"
+    [ "$3" = 0 ] || { echo "$1 ended with an error"; failures="$failures $1"; }
+}
+
 for program in "$@"; do
     begin=$(date +%s)
     echo "$program"
-    "$program" $quick --out "$folder" || { echo "$program ended with an error"; exit 1; }
-    echo "$program took $(($(date +%s) - begin)) s"
+    "$program" $quick --out "$folder"
+    ended "$program" "$begin" $?
+    assemble
 done
 
-# csv NAME COMMAND...: its output under a line of its origin; what it says on stderr into FOLDER/NAME.txt
+# csv NAME COMMAND...: its output under a line of its origin; what it says on stderr into FOLDER/NAME.txt, and what it
+# has done or skips to the terminal as well. The old table stays until the new one is whole. Status: whether it is.
 csv() {
     name=$1 begin=$(date +%s)
     shift
     echo "$name"
-    { echo "# $DIST_ORIGIN${quick:+; quick}" && "$@"; } >"$folder/$name.csv" 2>"$folder/$name.txt" ||
-        { cat "$folder/$name.txt"; echo "$name ended with an error"; exit 1; }
-    echo "$name took $(($(date +%s) - begin)) s"
+    echo "# $DIST_ORIGIN${quick:+; quick}" >"build/$name.csv"
+    {
+        "$@" 2>&1 >>"build/$name.csv" || echo "ended with an error: $name"
+    } | while IFS= read -r line; do
+        case $line in "done "* | "skip "* | *error* | *"not installed"*) echo "    $line" >&3 ;; esac
+        printf '%s\n' "$line"
+    done 3>&1 >"build/$name.txt"
+    ! grep -q -x "ended with an error: $name" "build/$name.txt"
+    status=$?
+    [ $status != 0 ] || { mv "build/$name.csv" "$folder/$name.csv" && mv "build/$name.txt" "$folder/$name.txt"; }
+    ended "$name" "$begin" $status
+    return $status
 }
 
 # section NAME TITLE COMMAND: the head of FOLDER/NAME.md; its text and tables follow from stdin
@@ -37,8 +79,7 @@ section() {
     } >"$folder/$1.md"
 }
 
-csv needs build/bench_needs $quick
-{
+csv needs build/bench_needs $quick && {
     echo "The embedded model, a picture of 256 x 256 (quick: 96) and, where a gradient is wanted, its adjoint."
     echo "Operations: multiply-adds; done: without those of dead units. Bytes: what context, shape and tape hold, without"
     echo "weights and the caller's planes. Seconds: median of 7."
@@ -47,8 +88,7 @@ csv needs build/bench_needs $quick
         "$folder/needs.csv"
 } | section needs "What a scene that needs less pays less for" build/bench_needs
 
-csv code_size sh bench/code_size.sh $quick
-{
+csv code_size sh bench/code_size.sh $quick && {
     echo "Bytes of code and constants at -Os; in parentheses what the switch saves. A compiler that is not installed is"
     echo "missing."
     echo
@@ -64,13 +104,14 @@ csv code_size sh bench/code_size.sh $quick
                   print line } }' "$folder/code_size.csv"
 } | section code_size "Bytes of code, by what is left out" "sh bench/code_size.sh"
 
-# The same step in PyTorch, where a python3 has it; else what is in FOLDER already stays.
+# The same step in PyTorch, where a python3 has it.
 for python in python3 /usr/bin/python3 ""; do
     [ -z "$python" ] || ! "$python" -c "import torch" 2>/dev/null || break
 done
+how="--steps 3"
+[ -z "$quick" ] || how="--case embedded --size 64 --steps 1"
 if [ -n "$python" ]; then
-    csv pytorch "$python" bench/pytorch.py ${quick:+--case embedded --size 64} --steps 3
-    {
+    csv pytorch "$python" bench/pytorch.py $how && {
         echo "A step of an optimization (a picture with silhouette, losses, gradient for the code, Adam), in PyTorch with the"
         echo "paper's tracer and in dist.h with its own, on the same processor with the same threads in one run;"
         echo "bench/pytorch.py says what was done to PyTorch's advantage. times: of dist.h's cold step."
@@ -81,29 +122,38 @@ if [ -n "$python" ]; then
             { print "| " $1 ", " $4 " pixels | " $2 " | " $3 " | " $6 " | " $11 " | " $7 " | " $8 " | " $9 " | " $10 " |" }' \
             "$folder/pytorch.csv"
     } | section pytorch "The same step in PyTorch" "python3 bench/pytorch.py"
-fi
-
-# Sweeps at one size, defaults at all; build/bench_work_precision --long sweeps at each. Plots of some: each is 0.2 MB.
-# About half an hour on one thread, of which the slow decoders take two minutes each.
-mkdir -p build/work_precision || exit 1
-if [ -n "$quick" ]; then
-    csv work_precision build/bench_work_precision --quick --case embedded_5 --largest 128 --sweep 64 \
-        --svg build/work_precision/q
-    table_size=64
-    cp build/work_precision/q_losses.svg "$folder/work_precision_losses.svg" || exit 1
-    shown="embedded_5_64"
 else
-    rm -f build/work_precision/*.svg
-    csv work_precision build/bench_work_precision --largest 1024 --sweep 128 --minutes 0.35 --svg build/work_precision/q
-    table_size=128
-    cp build/work_precision/q_losses.svg "$folder/work_precision_losses.svg" || exit 1
-    shown="torus_grazing_128 rods_1e-3_128 embedded_5_128 mug_128"
+    echo "no python3 here has PyTorch (Debian: python3-torch): $folder/pytorch.csv is left as it is, or missing"
 fi
-for name in $shown; do
-    plot=build/work_precision/q_$name.svg
-    [ ! -e "$plot" ] || cp "$plot" "$folder/work_precision_$name.svg"
-done
-{
+assemble
+
+# Every sweep at every size as far as the minutes go, one scene on each of two cores: about 35 minutes. A plot of each
+# scene and size is in build/work_precision, at 0.1 to 0.2 MB; some are shown.
+sweep() {
+    build/bench_work_precision --svg build/work_precision/q "$@" >build/work_precision/rows || return 1
+    head -n 1 build/work_precision/rows
+    build/bench_work_precision --list | while read -r name; do grep "^$name," build/work_precision/rows; done
+    return 0
+}
+rm -rf build/work_precision
+mkdir -p build/work_precision || exit 1
+table_size=128
+at_once=1
+shown="torus_grazing_128 rods_1e-3_128 embedded_5_128 mug_128 fox_512"
+how="--minutes 0.65"
+if [ -n "$quick" ]; then
+    table_size=64
+    shown="embedded_5_64"
+    how="--quick --case embedded_5 --largest 128 --minutes 0.05"
+elif [ "$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1)" -ge 2 ]; then
+    at_once=2
+    DIST_ORIGIN="$DIST_ORIGIN; another scene on the other core"
+fi
+csv work_precision sweep $how --at-once $at_once && {
+    for name in sizes losses $shown; do
+        plot=build/work_precision/q_$name.svg
+        [ ! -e "$plot" ] || cp "$plot" "$folder/work_precision_$name.svg"
+    done
     echo "Defaults only, $table_size x $table_size pixels: the error of the distance, against a reference in double, that"
     echo "99 % of the hits keep (wrong pixels of the mask; queries a pixel). The sweeps of epsilon, alpha, budget and K, every"
     echo "other measure and the times are in the csv. n/a: this processor has no such arithmetic, or the field is no network;"
@@ -129,8 +179,7 @@ guarded_bf16" '
                   print line } }' "$folder/work_precision.csv"
     echo
     echo "The default as pictures grow, in the same way, with the median of the seconds. Of pictures larger than 256 x 256"
-    echo "(chairs_3, spot_512 and spot_512_he: than 128 x 128, and none beyond 256) as many pixels, spread evenly, are"
-    echo "compared, and counted."
+    echo "(chairs_3, spot_512 and spot_512_he: than 128 x 128) as many pixels, spread evenly, are compared, and counted."
     echo
     awk -F , '
         /^#/ || /^case/ { next }
@@ -145,29 +194,21 @@ guarded_bf16" '
                   for (k = 1; k <= sizes; k++) line = line " " text[scene[i], size[k]] " |"
                   print line } }' "$folder/work_precision.csv"
     echo
+    echo "The epsilons of our default and of the paper's coarse-to-fine row at each size, as far as the time went:"
+    echo
+    echo "![as pictures grow](work_precision_sizes.svg)"
+    echo
     echo "Each scene's default against the best of all rows of the paper's tracer, by each measure for itself: above the"
     echo "line dist.h loses."
     echo
     echo "![where dist.h loses](work_precision_losses.svg)"
+    echo
+    echo "All that was measured of one scene at one size, of some; the program makes it of all."
     for name in $shown; do
         [ -e "$folder/work_precision_$name.svg" ] && printf '\n![%s](work_precision_%s.svg)\n' "$name" "$name"
     done
 } | section work_precision "Error against cost" "build/bench_work_precision"
 rm -f "$folder/needs.txt" "$folder/code_size.txt" "$folder/pytorch.txt"
-
-{
-    echo "# RESULTS"
-    echo
-    echo "Made by \`make results${quick:+-quick}\`; each section names its own command, the machine and the commit."
-    echo "Published numbers are of other shapes, decoders and machines."
-    # The tracer first, then what is fitted with it.
-    first="pytorch ladder marching threshold work_precision needs code_size"
-    for name in $first; do [ -e "$folder/$name.md" ] && echo && cat "$folder/$name.md"; done
-    for file in "$folder"/*.md; do
-        name=$(basename "$file" .md)
-        case " $first RESULTS " in *" $name "*) continue ;; esac
-        echo
-        cat "$file"
-    done
-} >"$folder/RESULTS.tmp" && mv "$folder/RESULTS.tmp" "$folder/RESULTS.md"
+assemble
 echo "$folder/RESULTS.md"
+[ -z "$failures" ] || { echo "failed:$failures; what they had made before stays"; exit 1; }

@@ -28,15 +28,15 @@
 
    --minutes bounds what a case's size takes beside its reference: the rows come in order of importance (`plan`), which
    is the csv's. One that takes more than a 40th of the time with 7 runs is made with fewer (column `runs`; the defaults
-   of the first four methods: more than an 8th); one that takes more than an 8th with a single run (of a slow decoder: a
-   third), or more than is left, is left out, with a word on stderr; but never the defaults of guarded, certified and the
+   of the first four methods: more than an 8th). One that takes more than an 8th with a single run (of a slow decoder: a
+   third), or more than is left, is left out, with a word on stderr; never the defaults of guarded, certified and the
    paper's two fastest rows (of slow decoders beyond 256 x 256: of guarded). "done" on stderr tells what a size took.
 
    --svg draws each case and size. Lines join the epsilons of one method, or its alphas or budgets of steps; the larger
    markers are the defaults. A marker is open where the picture failed: more than 1 in 1000 pixels that should be hit is
-   wrong, or as many hits of our own are farther off than their bound. STEM_sizes.svg holds the epsilons of guarded and of
-   the paper's coarse-to-fine row at each size, scene by scene. STEM_losses.svg holds our default against the best of all
-   of the paper's rows, by each measure for itself: points above the line are where dist.h loses. */
+   wrong, or as many hits of our own are farther off than their bound. STEM_sizes.svg holds the epsilons of guarded and
+   of the paper's coarse-to-fine row at each size, scene by scene. STEM_losses.svg holds our default against the best of
+   all of the paper's rows, by each measure for itself: points above the line are where dist.h loses. */
 #define DIST_IMPLEMENTATION
 #include "../dist.h"
 #include "../examples/common.h"
@@ -57,8 +57,8 @@ static const char usage[] =
     "  --minutes M        for each case and size, beside its reference (default: no bound)\n"
     "  --svg STEM         also plots, STEM_CASE_N.svg\n"
     "  --workers N        threads of a picture (default 1: then seconds vary least)\n"
-    "  --at-once N        cases at a time, each on a core of its own, cheap ones beside slow ones; rows of one case stay\n"
-    "                     in order (default 1)\n"
+    "  --at-once N        cases at a time, each on a core of its own, cheap ones beside slow ones; the rows of one\n"
+    "                     case stay in order (default 1)\n"
     "  --quick            64 pixels, few cases and few values\n";
 
 enum { SPHERE, TORUS, BOX, RODS, BUMPS };
@@ -535,7 +535,8 @@ typedef struct row {
     int size, runs;
     double queries, operations, seconds, fastest, slowest, silhouette_queries, silhouette_seconds;
     double mean, p99, largest, normal, silhouette, near, violations, touched;
-    double gradient_queries, gradient_seconds, code_cosine, code_error, camera_cosine, camera_error; /* errors < 0: there is none */
+    double gradient_queries, gradient_seconds;
+    double code_cosine, code_error, camera_cosine, camera_error; /* errors < 0: there is none */
     size_t compared, hits, holes, false_hits, unresolved, true_hits;
 } row;
 
@@ -1073,7 +1074,9 @@ static void add_row(sweep *w, const method *m, const char *parameter, double val
     dist_render_desc how = how_of(m, parameter, value);
     row r;
     memset(&r, 0, sizeof r);
-    if (*expected * (1 + OTHERS) <= most) { r = picture(&j, &how, m->dense, w->quick ? 3 : RUNS, limit, most); }
+    if (most > 0 && *expected * (1 + OTHERS) <= most) {
+        r = picture(&j, &how, m->dense, w->quick ? 3 : RUNS, limit, most);
+    }
     if (by_default && r.seconds > 0) { *expected = r.seconds; }
     if (!r.runs) {
         leave_out(w, m, parameter, &value);
@@ -1325,7 +1328,7 @@ typedef struct queue {
     int first, end;
 } queue;
 
-/* The next case: every second thread takes them from the end, so that a slow one has a cheap one beside it; -1: none. */
+/* The next case, or -1: every second thread takes them from the end, so that slow ones have cheap ones beside them. */
 static int next_case(queue *q, int thread)
 {
     int i = -1;

@@ -2,8 +2,9 @@
 # sh bench/results.sh [--quick] FOLDER PROGRAM...
 # Runs the programs that make the paper's tables and figures, and the benchmarks whose tables belong beside them, and
 # puts their sections together in FOLDER/RESULTS.md. From the root of the repository. A C compiler is enough; what else
-# is missing is left out with a sentence. If one program fails the others go on. Interrupted, or with a failure: what was
-# finished is in FOLDER and in its RESULTS.md, and a csv as far as it came in build/.
+# is missing is left out with a sentence. If one program fails the others go on. Interrupted, or with a failure: what
+# was finished is in FOLDER and in its RESULTS.md; a csv as far as it came is in build/, the rows of work_precision in
+# build/work_precision/rows.
 quick=
 [ "$1" = --quick ] && quick=--quick && shift
 folder=$1
@@ -32,8 +33,13 @@ assemble() {
         done
     } >"$folder/RESULTS.tmp" && mv "$folder/RESULTS.tmp" "$folder/RESULTS.md"
 }
-trap 'trap - INT TERM; assemble; echo "interrupted: $folder/RESULTS.md holds what was finished, now or before"; exit 130' \
-    INT TERM
+interrupted() {
+    trap - INT TERM
+    assemble
+    echo "interrupted: $folder/RESULTS.md holds what was finished, now or before; the rest is in build/"
+    exit 130
+}
+trap interrupted INT TERM
 
 # ended NAME BEGIN STATUS: says how long it took, since when all are at it, and whether it failed.
 ended() {
@@ -60,12 +66,16 @@ csv() {
     {
         "$@" 2>&1 >>"build/$name.csv" || echo "ended with an error: $name"
     } | while IFS= read -r line; do
-        case $line in "done "* | "skip "* | *error* | *"not installed"*) echo "    $line" >&3 ;; esac
+        case $line in "done "* | "skip "* | *"not installed"*) echo "    $line" >&3 ;; esac
         printf '%s\n' "$line"
     done 3>&1 >"build/$name.txt"
     ! grep -q -x "ended with an error: $name" "build/$name.txt"
     status=$?
-    [ $status != 0 ] || { mv "build/$name.csv" "$folder/$name.csv" && mv "build/$name.txt" "$folder/$name.txt"; }
+    if [ $status = 0 ]; then
+        mv "build/$name.csv" "$folder/$name.csv" && mv "build/$name.txt" "$folder/$name.txt"
+    else
+        tail -n 3 "build/$name.txt"
+    fi
     ended "$name" "$begin" $status
     return $status
 }

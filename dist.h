@@ -2193,7 +2193,8 @@ DISTI_PLAIN(scalar, static)
 #define DISTI_STORE_POSITIVE(i, V) { const DISTI_VEC b = DISTI_SET1(bias[i]); DISTI_X##V(DISTI_STORE_POSITIVE1, i) }
 
 /* Takes inputs from..to-1 of the list or of all; between two passes over DISTI_DEPTH rows the sums wait in y.
-   Weights are fetched `ahead` floats early: a little, or a whole panel where passes cut the panels. */
+   Weights are fetched `ahead` floats early: a little, or a whole panel where passes cut the panels. A tall tile, which
+   waits for memory most, fetches sixteen entries of its list early, at the end those of the tile that follows. */
 #define DISTI_GEMM_TILE(name, R, V, FACTORS)                                                                           \
     DISTI_NOINLINE DISTI_FUNCTION void disti_gemm_##name(const disti_gemm *g, int o, int c, int from, int to,          \
                                                           size_t ahead)                                                \
@@ -2208,10 +2209,17 @@ DISTI_PLAIN(scalar, static)
             DISTI_Y##R(DISTI_AGAIN, V)                                                                                 \
         }                                                                                                              \
         if (g->alive) {                                                                                                \
-            for (const int *alive = g->alive + from, *end = g->alive + to; alive < end; alive++) {                     \
+            const int *alive = g->alive + from, *const end = g->alive + to, *next = alive + DISTI_MIN(16, to - from);  \
+            size_t later = 0;                                                                                          \
+            for (; alive < end; alive++) {                                                                             \
                 const size_t k = (size_t)(unsigned)*alive;                                                             \
-                DISTI_AHEAD(w + k * 8, ahead);                                                                         \
-                if (R > 8) DISTI_AHEAD(w + panel + k * 8, ahead);                                                      \
+                if (R > 8) {                                                                                           \
+                    if (next == end) next = g->alive + from, later += 2 * panel;                                       \
+                    DISTI_AHEAD(w, later + (size_t)(unsigned)*next * 8);                                               \
+                    DISTI_AHEAD(w, later + panel + (size_t)(unsigned)*next++ * 8);                                     \
+                } else {                                                                                               \
+                    DISTI_AHEAD(w + k * 8, ahead);                                                                     \
+                }                                                                                                      \
                 DISTI_STEP(R, V, FACTORS, w + k * 8, x + k * DISTI_BLOCK)                                              \
             }                                                                                                          \
         } else {                                                                                                       \

@@ -10139,11 +10139,17 @@ static float disti_parabola(float h, float left, float middle, float right)
     return s > h ? h : s < -h ? -h : s;
 }
 
+/* s within the ray's part of the bounding sphere. */
+static float disti_ray_within(const disti_ray *ray, float s)
+{
+    return DISTI_MIN(DISTI_MAX(s, ray->enter), ray->leave);
+}
+
 /* Asks for f at s of ray `index`. */
 static size_t disti_silhouette_ask(const disti_bench *bench, int index, float s, size_t count)
 {
     disti_ray *ray = &bench->rays[index];
-    ray->q = DISTI_MIN(DISTI_MAX(s, ray->enter), ray->leave);
+    ray->q = disti_ray_within(ray, s);
     disti_ray_point(ray, ray->q, bench->points + 3 * count);
     bench->index[count] = index;
     return count + 1;
@@ -10159,33 +10165,34 @@ static void disti_silhouette_take(const disti_tracer *tracer, int worker, const 
     }
 }
 
-/* Parabolas through three samples around the least one of the rays with width > 0: how far apart, in units of f. */
+/* Parabolas through three samples around the least one of the rays with width > 0: how far apart, in units of f. Both
+   sides are asked for in one call, then where the parabola is least. */
 static void disti_silhouette_fit(const disti_tracer *tracer, int worker, const disti_bench *bench, int n)
 {
-    for (int phase = 0; phase < 3; phase++) { /* left, right, where the parabola is least */
+    for (int i = 0; i < n;) { /* as many rays as there is room for */
         size_t count = 0;
-        for (int i = 0; i < n; i++) {
+        for (; i < n && count + 2 <= (size_t)DISTI_TILE_RAYS; i++) {
             disti_ray *ray = &bench->rays[i];
             if (!(ray->width > 0.0f)) continue;
-            if (phase == 0) { /* a: the least sample as it stood */
-                ray->width = DISTI_MAX(ray->width * ray->fbest, 2e-3f * tracer->field->radius);
-                ray->a = ray->best;
-                ray->fa = ray->fbest;
-            }
-            float ds = phase == 0   ? -ray->width
-                       : phase == 1 ? ray->width
-                                    : disti_parabola(ray->width, ray->b, ray->fa, ray->fb);
-            count = disti_silhouette_ask(bench, i, ray->a + ds, count);
+            ray->width = DISTI_MAX(ray->width * ray->fbest, 2e-3f * tracer->field->radius);
+            ray->a = ray->best; /* the least sample as it stood */
+            ray->fa = ray->fbest;
+            count = disti_silhouette_ask(bench, i, ray->a - ray->width, count);
+            count = disti_silhouette_ask(bench, i, ray->a + ray->width, count);
         }
-        size_t asked = disti_silhouette_eval(tracer, worker, bench, count);
-        for (size_t k = 0; k < count; k++) {
-            disti_ray *ray = &bench->rays[bench->index[k]];
-            if (phase == 2 || k >= asked) ray->width = 0.0f;
-            if (k >= asked) continue;
-            if (phase == 0) ray->b = bench->sdf[k];
-            if (phase == 1) ray->fb = bench->sdf[k];
-            disti_keep_least(ray, ray->q, bench->sdf[k]);
+        size_t asked = disti_silhouette_eval(tracer, worker, bench, count), kept = 0;
+        for (size_t k = 0; k < count; k += 2) {
+            int index = bench->index[k];
+            disti_ray *ray = &bench->rays[index];
+            float width = ray->width;
+            ray->width = 0.0f;
+            if (k < asked) disti_keep_least(ray, disti_ray_within(ray, ray->a - width), bench->sdf[k]);
+            if (k + 1 >= asked) continue;
+            disti_keep_least(ray, disti_ray_within(ray, ray->a + width), bench->sdf[k + 1]);
+            float least = disti_parabola(width, bench->sdf[k], ray->fa, bench->sdf[k + 1]);
+            kept = disti_silhouette_ask(bench, index, ray->a + least, kept);
         }
+        disti_silhouette_take(tracer, worker, bench, kept);
     }
 }
 

@@ -8143,7 +8143,7 @@ typedef struct disti_ray {
     unsigned char side;  /* bracket, band: queries in it so far; marching: steps since a sample beyond was negative */
     unsigned char moved; /* band: 1 if the ray came into it from outside */
     unsigned char aim;   /* 1: the neighbors predict the hit at target, 2: but not how f falls there */
-    float target, incline; /* s, df/ds there */
+    float target, incline; /* s, df/ds there; bracket: disti_ray_bent, and its own */
     float off;             /* of a hit: how far the neighbors' prediction was from it; 0: there was none */
     unsigned char kept;  /* warm start: verified, not traced; a miss's best is where |f| is least */
     unsigned char own;   /* incline is df/ds at q: the sample came with its gradient; of a hit: it is the normal's */
@@ -8356,13 +8356,14 @@ static int disti_ray_ask(disti_ray *ray, int mode, float q)
 
 /* How far before a hit the surface may be for a ray that came down steeply, but crosses 0 slowly, by `falls`: between
    the two f bends, and where it is as flat as that, ripples of the surface's |f| may have crossed 0 before. Over a
-   bracket that is flat from the start they may have done so anywhere in it. No less than what f's noise hides. */
+   bracket that is flat from the start they may have done so anywhere in it, and where what was sampled before it says
+   that f crosses 0 earlier (disti_ray_bent), from there on. No less than what f's noise hides. */
 static float disti_ray_kink(const disti_tracer *tracer, const disti_ray *ray, float falls)
 {
     float most = 0.02f * tracer->field->radius, flat = tracer->noise;
     if (falls < 0.15f * tracer->lipschitz && ray->incline < -2.0f * falls)
         flat = 12.0f * disti_ray_epsilon(tracer, ray, ray->a);
-    flat = flat < most * falls ? flat / falls : most;
+    flat = DISTI_MAX(flat < most * falls ? flat / falls : most, ray->target);
     return ray->incline > -0.12f * tracer->lipschitz ? DISTI_MAX(flat, DISTI_MIN(ray->width, most)) : flat;
 }
 
@@ -8377,9 +8378,9 @@ static int disti_ray_bracket(const disti_tracer *tracer, disti_ray *ray)
     if (width <= epsilon) {
         float falls = (ray->fa - ray->fb) / width, before = -ray->slope, error = width;
         if (disti_coarse(tracer, epsilon) && ray->side == 0 && before > 0.0f && falls > 0.0f) {
-            /* as below: no farther than |f| takes from an end, where two slopes in a row are alike */
+            /* as below: no farther than |f| takes from an end at a third of the slopes, where two in a row are alike */
             float flatter = DISTI_MIN(falls, before), uneven = DISTI_MAX(falls, before) / flatter;
-            float off = 2.0f * DISTI_MIN(ray->fa, -ray->fb) * uneven * uneven + tracer->noise;
+            float off = 3.0f * DISTI_MIN(ray->fa, -ray->fb) * uneven * uneven + tracer->noise;
             if (off < width * flatter) error = DISTI_MAX(off / flatter, 0.2f * width);
         }
         ray->slope = -falls;
@@ -8427,6 +8428,15 @@ static int disti_ray_bracketed(const disti_tracer *tracer, disti_ray *ray, float
     return disti_ray_bracket(tracer, ray);
 }
 
+/* How far before the end of a bracket [a, b] f may have crossed 0: the slope before it foretells a crossing at
+   a + fa / -slope, and where f falls by less than 0.6 of that slope it has bent on the way, above 0 or below. Certified
+   steps allow no crossing before a. */
+static float disti_ray_bent(const disti_tracer *tracer, const disti_ray *ray, float a, float fa, float b, float fb)
+{
+    if (tracer->how.certified || !ray->known || -0.6f * ray->slope * (b - a) <= fa - fb) return 0.0f;
+    return b - a + fa / ray->slope;
+}
+
 static int disti_ray_open_bracket(const disti_tracer *tracer, disti_ray *ray, float a, float fa, float b, float fb)
 {
     ray->a = a;
@@ -8436,6 +8446,7 @@ static int disti_ray_open_bracket(const disti_tracer *tracer, disti_ray *ray, fl
     ray->width = b - a;
     ray->incline = (fb - fa) / (b - a);
     ray->side = 0;
+    ray->target = disti_ray_bent(tracer, ray, a, fa, b, fb);
     return disti_ray_bracket(tracer, ray);
 }
 
@@ -8670,9 +8681,10 @@ static int disti_ray_predicted(const disti_tracer *tracer, disti_ray *ray, float
         ray->slope = slope;
         if (length > 0.125f * (float)(ray->base + (double)ray->q) * ray->footprint) ray->own = 0; /* of a pixel: 1/16 */
         ray->off = DISTI_MAX(off < 0.0f ? -off : off, 1e-9f);
-        /* short of the surface nothing tells whether f flattens on the way, most likely where it is flat already */
+        /* short of the surface nothing tells whether f flattens on the way, most likely where it is flat already: nets
+           keep near half of epsilon for up to 18 times the step */
         float factor = disti_coarse(tracer, epsilon) ? 3.0f : 2.0f;
-        if (f > 0.0f && slope > -0.6f * tracer->lipschitz) factor = 10.0f;
+        if (f > 0.0f && slope > -0.6f * tracer->lipschitz) factor = 20.0f;
         return disti_ray_end(ray, DIST_RAY_HIT, ray->q + step, f, factor * length - tracer->noise / slope);
     }
     if (!good || ray->q + step <= (fronted ? ray->s : ray->start) || ray->q + step >= ray->leave) {

@@ -1183,6 +1183,41 @@ TEST(slopes_of_rings_beyond_those_sampled_are_reported)
     dist_context_destroy(ctx);
 }
 
+/* What rays of decoders met: f came down at a slope that foretold a crossing half way to where it crossed again, and
+   kept a height of 0.7 epsilon for 17 times as far as its slope said. */
+TEST(bounds_reach_to_where_f_was_foretold_to_cross_and_over_what_is_flat)
+{
+    dist_context *ctx = shape_context();
+    test_shape shape = shape_make(SHAPE_SPHERE, 0.8, 0, 0, 0);
+    dist_field field = shape_field(&shape, 1, 1);
+    disti_tracer tracer;
+    disti_ray ray;
+    for (int certified = 0; certified < 2; certified++) {
+        dist_render_desc how = plain_how();
+        how.certified = certified;
+        CHECK_STATUS(DIST_OK, disti_tracer_init(&tracer, ctx, &field, &how, "test"), ctx);
+        memset(&ray, 0, sizeof ray);
+        ray.sign = 1;
+        ray.known = 1;
+        ray.slope = -0.4373f;
+        CHECK(disti_ray_open_bracket(&tracer, &ray, 0, 5.211e-3f, 2.34e-2f, -5e-7f));
+        CHECK_EQUAL(0, disti_ray_bracketed(&tracer, &ray, -1.3e-6f));
+        CHECK_EQUAL(DIST_RAY_HIT, ray.status);
+        CHECK(certified ? ray.error < 1e-3f : ray.error > 9.3e-3f); /* was 2e-5 */
+    }
+    memset(&ray, 0, sizeof ray);
+    ray.sign = 1;
+    ray.base = 2;
+    ray.leave = 0.5f;
+    ray.fa = 3e38f;
+    ray.incline = -0.4686f;
+    ray.width = 4;
+    CHECK_EQUAL(0, disti_ray_predicted(&tracer, &ray, 3.572e-5f));
+    CHECK_EQUAL(DIST_RAY_HIT, ray.status);
+    CHECK(ray.error > 1.28e-3f && ray.error < 2e-3f);
+    dist_context_destroy(ctx);
+}
+
 TEST(error_bounds_hold_for_999_hits_of_1000)
 {
     dist_context *ctx = shape_context();
@@ -1359,6 +1394,7 @@ int main(int argc, char **argv)
     RUN(the_paper_converges_up_to_slope_1_2_and_not_from_1_34_on);
     RUN(a_slope_beyond_the_lipschitz_figure_is_reported);
     RUN(slopes_of_rings_beyond_those_sampled_are_reported);
+    RUN(bounds_reach_to_where_f_was_foretold_to_cross_and_over_what_is_flat);
     RUN(error_bounds_hold_for_999_hits_of_1000);
     RUN(error_bounds_hold_for_999_hits_of_1000_of_real_decoders);
     RUN(depth_of_real_decoders_is_that_of_double);

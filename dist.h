@@ -2192,16 +2192,9 @@ DISTI_PLAIN(scalar, static)
 #define DISTI_STORE_RELU(i, V) { const DISTI_VEC b = DISTI_SET1(bias[i]); DISTI_X##V(DISTI_STORE_RELU1, i) }
 #define DISTI_STORE_POSITIVE(i, V) { const DISTI_VEC b = DISTI_SET1(bias[i]); DISTI_X##V(DISTI_STORE_POSITIVE1, i) }
 
-#define DISTI_PAIR(R, V, FACTORS, w, x)                                                                                \
-    DISTI_AHEAD(w, ahead);                                                                                             \
-    if (R > 8) DISTI_AHEAD((w) + panel, ahead);                                                                        \
-    DISTI_STEP(R, V, FACTORS, w, x)                                                                                    \
-    DISTI_STEP(R, V, FACTORS, (w) + 8, (x) + DISTI_BLOCK)
-
 /* Takes inputs from..to-1 of the list or of all; between two passes over DISTI_DEPTH rows the sums wait in y.
    Weights are fetched `ahead` floats early: a little, or a whole panel where passes cut the panels. A tall tile, which
-   waits for memory most, fetches sixteen entries of its list early, at the end those of the tile that follows. AVX2's
-   twelve sums hide a multiply-add's latency with little to spare; its loop counts every eight steps: faster. */
+   waits for memory most, fetches sixteen entries of its list early, at the end those of the tile that follows. */
 #define DISTI_GEMM_TILE(name, R, V, FACTORS)                                                                           \
     DISTI_NOINLINE DISTI_FUNCTION void disti_gemm_##name(const disti_gemm *g, int o, int c, int from, int to,          \
                                                           size_t ahead)                                                \
@@ -2233,15 +2226,11 @@ DISTI_PLAIN(scalar, static)
             const float *end = w + (size_t)(unsigned)to * 8;                                                           \
             w += (size_t)(unsigned)from * 8;                                                                           \
             x += (size_t)(unsigned)from * DISTI_BLOCK;                                                                 \
-            const float *eights = DISTI_LANES == 8 ? w + (size_t)(unsigned)(to - from) / 8 * 64 : w;                   \
-            for (; w < eights; w += 8 * 8, x += 8 * DISTI_BLOCK) {                                                     \
-                DISTI_PAIR(R, V, FACTORS, w, x)                                                                        \
-                DISTI_PAIR(R, V, FACTORS, w + 2 * 8, x + 2 * DISTI_BLOCK)                                              \
-                DISTI_PAIR(R, V, FACTORS, w + 4 * 8, x + 4 * DISTI_BLOCK)                                              \
-                DISTI_PAIR(R, V, FACTORS, w + 6 * 8, x + 6 * DISTI_BLOCK)                                              \
-            }                                                                                                          \
             for (; DISTI_UNROLLED && end - w >= 2 * 8; w += 2 * 8, x += 2 * DISTI_BLOCK) {                             \
-                DISTI_PAIR(R, V, FACTORS, w, x)                                                                        \
+                DISTI_AHEAD(w, ahead);                                                                                 \
+                if (R > 8) DISTI_AHEAD(w + panel, ahead);                                                              \
+                DISTI_STEP(R, V, FACTORS, w, x)                                                                        \
+                DISTI_STEP(R, V, FACTORS, w + 8, x + DISTI_BLOCK)                                                      \
             }                                                                                                          \
             for (; w < end; w += 8, x += DISTI_BLOCK) DISTI_STEP(R, V, FACTORS, w, x)                                  \
         }                                                                                                              \
@@ -2955,7 +2944,6 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_STORE_PART
 #undef DISTI_STORE_SUM
 #undef DISTI_STORE_RELU
-#undef DISTI_PAIR
 #undef DISTI_GEMM_TILE
 #undef DISTI_OFFSET
 #undef DISTI_RETURN1

@@ -11231,7 +11231,9 @@ static void disti_warm_hits(disti_warm *warm, int pass)
         ray->slope = warm->tape->value[pixel];
         unsigned other = ((unsigned)(x / 2 + y / 2) + warm->tape->turn / 4u) & 3u;
         if (pass == 1 && wide <= epsilon && other != 0) spread = wide;
-        float error = 8.0f * epsilon + 2.0f * spread - 3.0f * warm->typical / ray->slope; /* amid others at a crease */
+        /* amid others at a crease; where the picture has hardly moved, those may only have mended old errors of theirs */
+        float unlike = DISTI_MAX(-3.0f * warm->typical / ray->slope, move < 0.0f ? -move : move);
+        float error = 8.0f * epsilon + 2.0f * spread + unlike;
         if (spread <= 5.0f * epsilon) disti_warm_hit(warm, i, s + move, 0.0f, error);
         else disti_warm_list(warm, i, DISTI_ASK_NEWTON, s + move);
     }

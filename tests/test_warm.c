@@ -286,6 +286,45 @@ TEST(trained_nets_of_the_test_data_do_not_drift_either)
     check_steps("mug_camera_bottle", 0, 4e-4f, 0, 40, 2.0);
 }
 
+/* What neighbors moved by may be an old error of theirs that they mended. */
+TEST(moved_hits_of_a_fine_epsilon_keep_their_error_bounds)
+{
+    int both = 0, far = 0;
+    for (int code = 5; code < (test_quick() ? 25 : 255); code += 10) {
+        scene s;
+        float mine[256], beside[256];
+        memset(&s, 0, sizeof s);
+        s.ctx = shape_context();
+        dist_net *net = load_net_or_skip(s.ctx, "embedded");
+        REQUIRE(net != NULL && dist_net_code_size(net) <= 256);
+        memcpy(mine, dist_net_code(net, code), (size_t)dist_net_code_size(net) * sizeof(float));
+        for (int i = 0; i < dist_net_code_size(net); i++) beside[i] = mine[i] * (i % 2 ? 1.0005f : 0.9995f);
+        dist_shape *shape = dist_shape_create(s.ctx, net, mine);
+        s.field = dist_shape_field(shape);
+        s.camera = bench_camera(&s.field, 64, 64);
+        s.how.warm_start = 1;
+        s.how.epsilon = 1e-6f;
+        s.tape = dist_tape_create(s.ctx, &s.camera, &s.how);
+        for (int i = 0; i < 16; i++) {
+            dist_shape_set_code(shape, i % 2 ? mine : beside);
+            render(&s, 1, i & 4, &warm);
+        }
+        s.how.epsilon = 1e-7f;
+        s.how.certified = 1;
+        render(&s, 0, 0, &cold);
+        for (int i = 0; i < 64 * 64; i++) {
+            if (!cold.mask[i] || !warm.mask[i]) continue;
+            both++;
+            far += fabsf(cold.distance[i] - warm.distance[i]) > cold.error[i] + warm.error[i];
+        }
+        dist_shape_destroy(shape);
+        dist_net_destroy(net);
+        scene_close(&s);
+    }
+    CHECK(both > 500);
+    CHECK(far * 1000 <= both);
+}
+
 TEST(a_warm_start_needs_its_tape)
 {
     scene s;
@@ -327,6 +366,7 @@ int main(int argc, char **argv)
     RUN(another_camera_or_field_is_a_cold_start);
     RUN(nets_that_move_by_half_a_thousandth_cost_1_2_queries_a_hit_and_do_not_drift);
     RUN(trained_nets_of_the_test_data_do_not_drift_either);
+    RUN(moved_hits_of_a_fine_epsilon_keep_their_error_bounds);
     RUN(a_warm_start_needs_its_tape);
     return test_report();
 }

@@ -11231,7 +11231,7 @@ static void disti_warm_hits(disti_warm *warm, int pass)
         ray->slope = warm->tape->value[pixel];
         unsigned other = ((unsigned)(x / 2 + y / 2) + warm->tape->turn / 4u) & 3u;
         if (pass == 1 && wide <= epsilon && other != 0) spread = wide;
-        /* amid others at a crease; where the picture has hardly moved, those may only have mended old errors of theirs */
+        /* amid others at a crease; where the picture has hardly moved, those may have mended old errors of theirs */
         float unlike = DISTI_MAX(-3.0f * warm->typical / ray->slope, move < 0.0f ? -move : move);
         float error = 8.0f * epsilon + 2.0f * spread + unlike;
         if (spread <= 5.0f * epsilon) disti_warm_hit(warm, i, s + move, 0.0f, error);
@@ -11806,8 +11806,8 @@ static void disti_cones_task(void *arg, int index, int worker)
     for (int i = 0; i < count; i++) to[i]->size = 0;
 }
 
-/* Number of the tile that is the index-th task: from the middle outward, ring by ring, so that what costs most has begun
-   when workers run out of tiles. */
+/* Number of the tile that is the index-th task: from the middle outward, ring by ring, so that what costs most has
+   begun when workers run out of tiles. */
 static int disti_tile_order(int across, int down, int index)
 {
     int width = across & 1 ? 1 : 2, height = down & 1 ? 1 : 2, w = 0, h = 0; /* with this ring, and without */

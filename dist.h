@@ -11806,40 +11806,12 @@ static void disti_cones_task(void *arg, int index, int worker)
     for (int i = 0; i < count; i++) to[i]->size = 0;
 }
 
-/* Number of the tile that is the index-th task: from the middle outward, ring by ring, so that what costs most has
-   begun when workers run out of tiles. */
-static int disti_tile_order(int across, int down, int index)
-{
-    int width = across & 1 ? 1 : 2, height = down & 1 ? 1 : 2, w = 0, h = 0; /* with this ring, and without */
-    while (index >= width * height) {
-        w = width;
-        h = height;
-        width = DISTI_MIN(width + 2, across);
-        height = DISTI_MIN(height + 2, down);
-    }
-    int left = (width - w) / 2, top = (height - h) / 2, beside = h * (width - w), x, y;
-    index -= w * h;
-    if (index < top * width) {
-        x = index % width;
-        y = index / width;
-    } else if ((index -= top * width) < beside) {
-        x = index % (width - w);
-        y = top + index / (width - w);
-        if (x >= left) x += w;
-    } else {
-        x = (index - beside) % width;
-        y = top + h + (index - beside) / width;
-    }
-    return ((down - height) / 2 + y) * across + (across - width) / 2 + x;
-}
-
 static void disti_render_task(void *arg, int index, int worker)
 {
     const disti_render_job *job = (const disti_render_job *)arg;
     const disti_tracer *tracer = job->tracer;
     disti_bench bench;
     disti_tile tile;
-    index = disti_tile_order(job->across, job->count / job->across, index);
     disti_bench_init(tracer->ctx, worker, &bench);
     disti_tile_init(job, index, &tile);
     disti_budget budget;

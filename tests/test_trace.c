@@ -1360,25 +1360,6 @@ TEST(depth_of_real_decoders_is_that_of_double)
     dist_context_destroy(ctx);
 }
 
-/* From the middle outward, each once. */
-TEST(tiles_are_traced_from_the_middle_outward)
-{
-    for (int across = 1; across <= 9; across++) {
-        for (int down = 1; down <= 9; down++) {
-            int seen[81] = {0}, before = 0;
-            for (int i = 0; i < across * down; i++) {
-                int tile = disti_tile_order(across, down, i);
-                REQUIRE(tile >= 0 && tile < across * down && !seen[tile]);
-                seen[tile] = 1;
-                int x = abs(2 * (tile % across) + 1 - across), y = abs(2 * (tile / across) + 1 - down);
-                int ring = (x > y ? x : y) / 2;
-                CHECK(ring >= before);
-                before = ring;
-            }
-        }
-    }
-}
-
 int main(int argc, char **argv)
 {
     test_begin(argc, argv);
@@ -1417,6 +1398,5 @@ int main(int argc, char **argv)
     RUN(error_bounds_hold_for_999_hits_of_1000);
     RUN(error_bounds_hold_for_999_hits_of_1000_of_real_decoders);
     RUN(depth_of_real_decoders_is_that_of_double);
-    RUN(tiles_are_traced_from_the_middle_outward);
     return test_report();
 }

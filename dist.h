@@ -8429,8 +8429,8 @@ static int disti_ray_bracketed(const disti_tracer *tracer, disti_ray *ray, float
 }
 
 /* How far before the end of a bracket [a, b] f may have crossed 0: the slope before it foretells a crossing at
-   a + fa / -slope, and where f falls by less than 0.6 of that slope it has bent on the way, above 0 or below. Certified
-   steps allow no crossing before a. */
+   a + fa / -slope, and where f falls by less than 0.6 of that slope (chosen, not derived) it has bent on the way, above
+   0 or below. Certified steps allow no crossing before a. */
 static float disti_ray_bent(const disti_tracer *tracer, const disti_ray *ray, float a, float fa, float b, float fb)
 {
     if (tracer->how.certified || !ray->known || -0.6f * ray->slope * (b - a) <= fa - fb) return 0.0f;
@@ -8681,8 +8681,8 @@ static int disti_ray_predicted(const disti_tracer *tracer, disti_ray *ray, float
         ray->slope = slope;
         if (length > 0.125f * (float)(ray->base + (double)ray->q) * ray->footprint) ray->own = 0; /* of a pixel: 1/16 */
         ray->off = DISTI_MAX(off < 0.0f ? -off : off, 1e-9f);
-        /* short of the surface nothing tells whether f flattens on the way, most likely where it is flat already: nets
-           keep near half of epsilon for up to 18 times the step */
+        /* short of the surface nothing tells whether f flattens on the way, most likely where it is flat already: 2, 3
+           and 20 are chosen by what decoders do, not derived */
         float factor = disti_coarse(tracer, epsilon) ? 3.0f : 2.0f;
         if (f > 0.0f && slope > -0.6f * tracer->lipschitz) factor = 20.0f;
         return disti_ray_end(ray, DIST_RAY_HIT, ray->q + step, f, factor * length - tracer->noise / slope);

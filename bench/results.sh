@@ -137,8 +137,8 @@ else
 fi
 assemble
 
-# Every sweep at every size as far as the minutes go, one scene on each of two cores: about 35 minutes. A plot of each
-# scene and size is in build/work_precision, at 0.1 to 0.2 MB; some are shown.
+# Every sweep at every size as far as the minutes go, one scene on each of two cores. A plot of each scene and size is
+# in build/work_precision; some are shown.
 sweep() {
     build/bench_work_precision --svg build/work_precision/q "$@" >build/work_precision/rows || return 1
     head -n 1 build/work_precision/rows

@@ -1183,8 +1183,8 @@ TEST(slopes_of_rings_beyond_those_sampled_are_reported)
     dist_context_destroy(ctx);
 }
 
-/* What rays of decoders met: f came down at a slope that foretold a crossing half way to where it crossed again, and
-   kept a height of 0.7 epsilon for 17 times as far as its slope said. */
+/* What rays of decoders met: f came down at a slope that foretold a crossing half way to where it crossed again; kept a
+   height of 0.7 epsilon for 17 times as far as its slope said; and crossed 0 at .23 of a coarse bracket, not at .1. */
 TEST(bounds_reach_to_where_f_was_foretold_to_cross_and_over_what_is_flat)
 {
     dist_context *ctx = shape_context();
@@ -1215,6 +1215,15 @@ TEST(bounds_reach_to_where_f_was_foretold_to_cross_and_over_what_is_flat)
     CHECK_EQUAL(0, disti_ray_predicted(&tracer, &ray, 3.572e-5f));
     CHECK_EQUAL(DIST_RAY_HIT, ray.status);
     CHECK(ray.error > 1.28e-3f && ray.error < 2e-3f);
+    dist_render_desc how = plain_how();
+    how.epsilon = 1e-2f;
+    CHECK_STATUS(DIST_OK, disti_tracer_init(&tracer, ctx, &field, &how, "test"), ctx);
+    memset(&ray, 0, sizeof ray);
+    ray.sign = 1;
+    ray.slope = -1;
+    CHECK_EQUAL(0, disti_ray_open_bracket(&tracer, &ray, 0, 4e-4f, 4e-3f, -3.6e-3f));
+    CHECK_EQUAL(DIST_RAY_HIT, ray.status);
+    CHECK(ray.error > 1.1e-3f && ray.error < 2e-3f); /* was 8e-4 */
     dist_context_destroy(ctx);
 }
 

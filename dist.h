@@ -8314,7 +8314,7 @@ static float disti_ray_epsilon(const disti_tracer *tracer, const disti_ray *ray,
 /* Whether an epsilon is so much larger than the default that over the lengths it allows slopes may differ by twice. */
 static int disti_coarse(const disti_tracer *tracer, float epsilon)
 {
-    return epsilon > 2e-3f * tracer->detail;
+    return epsilon > 4e-4f * tracer->detail;
 }
 
 /* |f| from which on the ray feels its way: a coarse epsilon says how exact a hit is to be, not what may be passed. */
@@ -8381,7 +8381,7 @@ static int disti_ray_bracket(const disti_tracer *tracer, disti_ray *ray)
             /* as below: no farther than |f| takes from an end at a third of the slopes, where two in a row are alike */
             float flatter = DISTI_MIN(falls, before), uneven = DISTI_MAX(falls, before) / flatter;
             float off = 3.0f * DISTI_MIN(ray->fa, -ray->fb) * uneven * uneven + tracer->noise;
-            if (off < width * flatter) error = DISTI_MAX(off / flatter, 0.2f * width);
+            if (off < width * flatter) error = DISTI_MAX(off / flatter, 0.5f * width);
         }
         ray->slope = -falls;
         return disti_ray_end(ray, DIST_RAY_HIT, q, 0.0f, DISTI_MAX(error, disti_ray_kink(tracer, ray, falls)));
@@ -8437,8 +8437,17 @@ static float disti_ray_bent(const disti_tracer *tracer, const disti_ray *ray, fl
     return b - a + fa / ray->slope;
 }
 
+/* Into the bracket [a, b], or from the nearest sample in it on, if the march had one and took it back. */
 static int disti_ray_open_bracket(const disti_tracer *tracer, disti_ray *ray, float a, float fa, float b, float fb)
 {
+    float best = ray->fbest * ray->sign;
+    int marching = ray->mode == DISTI_MARCH || ray->mode == DISTI_SKIP || ray->mode == DISTI_JUMP;
+    ray->target = disti_ray_bent(tracer, ray, a, fa, b, fb);
+    if (marching && ray->best > a && ray->best < b && best > 0.0f && best < fa) {
+        a = ray->best;
+        fa = best;
+        ray->target = DISTI_MAX(ray->target, disti_ray_bent(tracer, ray, a, fa, b, fb));
+    }
     ray->a = a;
     ray->fa = fa;
     ray->b = b;
@@ -8446,7 +8455,6 @@ static int disti_ray_open_bracket(const disti_tracer *tracer, disti_ray *ray, fl
     ray->width = b - a;
     ray->incline = (fb - fa) / (b - a);
     ray->side = 0;
-    ray->target = disti_ray_bent(tracer, ray, a, fa, b, fb);
     return disti_ray_bracket(tracer, ray);
 }
 
@@ -8502,7 +8510,8 @@ static int disti_ray_step(const disti_tracer *tracer, disti_ray *ray)
 }
 
 /* A step that the spheres of radius f / L at its two ends do not cover is taken back, unless it is too short to
-   matter or it followed a surface at a low angle and found f about where the slope said. */
+   matter or it followed a surface at a low angle and found f about where the slope said, not almost 0 instead: that may
+   be the far side of what it went through. */
 static int disti_ray_trusts(const disti_tracer *tracer, const disti_ray *ray, float f, float step)
 {
     float expected = ray->f + ray->slope * step;
@@ -8510,7 +8519,18 @@ static int disti_ray_trusts(const disti_tracer *tracer, const disti_ray *ray, fl
     int creeps = ray->slope > -0.3f * tracer->lipschitz && step <= 1.001f * disti_ray_floor(tracer, ray);
     if (creeps && expected > 0.0f) return 1;
     float off = f - expected;
+    if (f < 0.25f * expected && -off > 0.1f * ray->f) return 0;
     return ray->mode == DISTI_JUMP && expected > 0.0f && (off < 0.0f ? -off : off) < 0.3f * ray->f;
+}
+
+/* A step down from a to s that was trusted though spheres do not cover it, no mere chord, and now f rises from s: does
+   it do so from a crossing between the two? */
+static int disti_ray_doubts(const disti_tracer *tracer, const disti_ray *ray, float f, float step)
+{
+    float last = ray->s - ray->a, before = disti_empty(tracer, ray->fa), rise = f - ray->f;
+    if (tracer->how.certified || !(ray->fa > ray->f) || ray->fb < 0.0f || !(rise > 0.0f) || last <= 0.0f) return 0;
+    if (last <= before + disti_empty(tracer, ray->f) || last <= 2.0f * disti_ray_floor(tracer, ray)) return 0;
+    return ray->f * step < rise * (last - before);
 }
 
 /* Feels ahead in the band 0 < f < epsilon, farther each time; certified only as far as is proven empty. */
@@ -8663,6 +8683,18 @@ static int disti_ray_aim(disti_ray *ray)
     return disti_ray_ask(ray, DISTI_PREDICT, ray->target);
 }
 
+/* How far a step of Newton's from f along a slope may end from the surface. Short of it nothing tells whether f bends
+   on the way, most likely where it is flat already; a slope that is not the ray's own says little over the lengths of a
+   coarse epsilon: 2, 5, 20 and .75 of epsilon are chosen by what decoders do, not derived. */
+static float disti_newton_error(const disti_tracer *tracer, float epsilon, float f, float slope, float length,
+                                int own)
+{
+    int coarse = disti_coarse(tracer, epsilon);
+    float error = (f > 0.0f && slope > -0.6f * tracer->lipschitz ? 20.0f : coarse ? 5.0f : 2.0f) * length;
+    if (coarse && !own) error = DISTI_MAX(error, 0.75f * epsilon);
+    return error - tracer->noise / slope;
+}
+
 /* A sample where the neighbors' hits and slopes predicted this ray's: Newton's steps, the first by their slope, as long
    as these are alike (it is off by about its length times 3 % and half of what they differ), the others, and any for a
    sample that came with its gradient, by its own. A step too long to trust, or f that does not shrink, sends the ray
@@ -8674,6 +8706,7 @@ static int disti_ray_predicted(const disti_tracer *tracer, disti_ray *ray, float
     float slope = first || ray->own ? ray->incline : (f - ray->fa) / (ray->q - ray->a);
     float step = -f / slope, length = step < 0.0f ? -step : step;
     float magnitude = f < 0.0f ? -f : f, before = ray->fa < 0.0f ? -ray->fa : ray->fa;
+    if (first && fronted && f > 0.0f) before = 0.5f * ray->f; /* the front's: it fell, or it ends elsewhere */
     int good = slope < -0.12f * tracer->lipschitz && length < 0.03f * tracer->field->radius && magnitude < before &&
                ray->side < 5;
     if (good && (!foreign || ray->width > 0.0f) && length <= (foreign ? ray->width : 12.0f) * epsilon) {
@@ -8681,11 +8714,8 @@ static int disti_ray_predicted(const disti_tracer *tracer, disti_ray *ray, float
         ray->slope = slope;
         if (length > 0.125f * (float)(ray->base + (double)ray->q) * ray->footprint) ray->own = 0; /* of a pixel: 1/16 */
         ray->off = DISTI_MAX(off < 0.0f ? -off : off, 1e-9f);
-        /* short of the surface nothing tells whether f flattens on the way, most likely where it is flat already: 2, 3
-           and 20 are chosen by what decoders do, not derived */
-        float factor = disti_coarse(tracer, epsilon) ? 3.0f : 2.0f;
-        if (f > 0.0f && slope > -0.6f * tracer->lipschitz) factor = 20.0f;
-        return disti_ray_end(ray, DIST_RAY_HIT, ray->q + step, f, factor * length - tracer->noise / slope);
+        float error = disti_newton_error(tracer, epsilon, f, slope, length, ray->own);
+        return disti_ray_end(ray, DIST_RAY_HIT, ray->q + step, f, error);
     }
     if (!good || ray->q + step <= (fronted ? ray->s : ray->start) || ray->q + step >= ray->leave) {
         if (f < 0.0f && !(ray->fb < 0.0f)) {
@@ -8770,6 +8800,16 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
                 ray->b = q;
                 ray->fb = f;
             }
+            return disti_ray_ask(ray, DISTI_MARCH, DISTI_MIN(ray->s + DISTI_MAX(radius, spacing), ray->leave));
+        }
+        if (disti_ray_doubts(tracer, ray, f, step)) { /* back to where the last step began, and keep where it ended */
+            ray->slope = (ray->f - ray->fa) / (ray->s - ray->a);
+            ray->b = ray->s;
+            ray->fb = ray->f;
+            ray->s = ray->a;
+            ray->f = ray->fa;
+            ray->fa = 0.0f;
+            radius = disti_empty(tracer, ray->f);
             return disti_ray_ask(ray, DISTI_MARCH, DISTI_MIN(ray->s + DISTI_MAX(radius, spacing), ray->leave));
         }
         if (ray->fb < 0.0f) { /* a crossing lies before b: is there room for another before it? */
@@ -11127,7 +11167,7 @@ static int disti_warm_newton(disti_warm *warm, int i, float f)
     ray->q += step;
     steep = slope < -0.3f * warm->tracer->lipschitz;
     if (good && length <= (!first ? 12.0f : steep ? 8.0f : 4.0f) * epsilon) {
-        disti_warm_hit(warm, i, ray->q, f, 2.0f * length - warm->tracer->noise / slope);
+        disti_warm_hit(warm, i, ray->q, f, disti_newton_error(warm->tracer, epsilon, f, slope, length, 0));
         disti_warm_change(warm, moved * slope);
         return 0;
     }

@@ -1040,7 +1040,7 @@ static int bound_side(void)
 
 /* picture_a is traced and compared with picture_b, the truth: of the hits that are also the truth's, 999 of 1000 at
    least must be off by no more than their error and the truth's together. Hits where the truth has none are false, and
-   at most 1 in 1000, like those of which the truth is not known. With a `how` of its own: 998, and 2 in 1000. */
+   at most 1 in 1000, like those of which the truth is not known. With a `how` of its own: 2 in 1000. */
 static void bound_check(dist_context *ctx, const char *name, const dist_field *field, const dist_camera *camera,
                         const dist_render_desc *how)
 {
@@ -1061,8 +1061,7 @@ static void bound_check(dist_context *ctx, const char *name, const dist_field *f
         held += over <= 0;
         worst = fmax(worst, over);
     }
-    int beyond = how ? 2 : 1; /* in 1000 */
-    int good = CHECK(both > 0) & CHECK(held >= (1 - 0.001 * beyond) * both) & CHECK(phantom * 1000 <= beyond * hits) &
+    int good = CHECK(both > 0) & CHECK(held >= 0.999 * both) & CHECK(phantom * 1000 <= (how ? 2 : 1) * hits) &
                CHECK(unknown <= 2 + hits / 1000); /* flat at float noise */
     if (!good || test_state.verbose)
         printf("    %s: hits %d, within the bound %.3f %%, beyond it by %.1e at most, false %d, truth unknown %d\n",
@@ -1097,7 +1096,7 @@ static void bound_check_shape(dist_context *ctx, const char *name, const shape_c
 
 /* The truth is a certified picture to 1e-7 with twice the sampled slopes, which alone are no bounds: with them, too,
    nearer surfaces are passed. */
-static void bound_check_decoder(dist_context *ctx, const char *path, int code, int coarse)
+static void bound_check_decoder(dist_context *ctx, const char *path, int code)
 {
     char name[96];
     dist_camera camera = shape_camera(bound_side(), bound_side());
@@ -1117,7 +1116,7 @@ static void bound_check_decoder(dist_context *ctx, const char *path, int code, i
         bound_check(ctx, name, &field, &camera, NULL);
         how.certified = how.max_steps = 0;
         how.epsilon = 1e-2f; /* what comes near without a crossing is no hit for that */
-        if (coarse) bound_check(ctx, name, &field, &camera, &how);
+        bound_check(ctx, name, &field, &camera, &how);
     }
     dist_shape_destroy(shape);
     dist_net_destroy(net);
@@ -1223,7 +1222,107 @@ TEST(bounds_reach_to_where_f_was_foretold_to_cross_and_over_what_is_flat)
     ray.slope = -1;
     CHECK_EQUAL(0, disti_ray_open_bracket(&tracer, &ray, 0, 4e-4f, 4e-3f, -3.6e-3f));
     CHECK_EQUAL(DIST_RAY_HIT, ray.status);
-    CHECK(ray.error > 1.1e-3f && ray.error < 2e-3f); /* was 8e-4 */
+    CHECK(ray.error > 1.1e-3f && ray.error < 2.1e-3f); /* was 8e-4 */
+    dist_context_destroy(ctx);
+}
+
+/* What rays of decoders went through: a jump by two samples ended where f was 3e-5, not .0075 as foretold, behind a
+   wall; one ended at about what was foretold, but from there f rose as from a crossing before it. A sample that a jump
+   brought, and the check took back, is where the bracket begins: f was flat from there on. */
+TEST(steps_that_may_have_gone_through_something_are_taken_back)
+{
+    dist_context *ctx = shape_context();
+    test_shape shape = shape_make(SHAPE_SPHERE, 0.8, 0, 0, 0);
+    dist_field field = shape_field(&shape, 1, 1.125);
+    dist_render_desc how = plain_how();
+    disti_tracer tracer;
+    disti_ray ray;
+    CHECK_STATUS(DIST_OK, disti_tracer_init(&tracer, ctx, &field, &how, "test"), ctx);
+    memset(&ray, 0, sizeof ray);
+    ray.sign = ray.leave = 1;
+    ray.base = 2;
+    ray.known = 1;
+    ray.mode = DISTI_JUMP;
+    ray.s = 0.25487f;
+    ray.f = 3.8564e-2f;
+    ray.slope = -0.2855f;
+    CHECK(!disti_ray_trusts(&tracer, &ray, 3.4974e-5f, 0.108897f));
+    CHECK(disti_ray_trusts(&tracer, &ray, 3.7e-3f, 0.108897f));
+    ray.a = 0.341199f;
+    ray.fa = 2.388e-2f;
+    ray.s = 0.404929f;
+    ray.f = 1.0003e-2f;
+    ray.slope = -0.2178f;
+    ray.q = 0.431654f;
+    CHECK(disti_ray_doubts(&tracer, &ray, 2.4429e-2f, ray.q - ray.s));
+    CHECK(!disti_ray_doubts(&tracer, &ray, 1.2e-2f, ray.q - ray.s)); /* so gently, f was above 0 all the way */
+    CHECK_EQUAL(1, disti_ray_advance(&tracer, &ray, 2.4429e-2f));
+    CHECK_NEAR(0.341199, ray.s, 1e-6);
+    CHECK_NEAR(0.404929, ray.b, 1e-6);
+    CHECK(ray.q > ray.s && ray.q < ray.b && ray.mode == DISTI_MARCH);
+    tracer.how.certified = 1;
+    ray.fa = 2.388e-2f;
+    CHECK(!disti_ray_doubts(&tracer, &ray, 2.4429e-2f, 0.0267f)); /* nothing was trusted there */
+    tracer.how.certified = 0;
+    memset(&ray, 0, sizeof ray);
+    ray.sign = 1;
+    ray.known = 1;
+    ray.slope = -0.7227f;
+    ray.best = 8.1e-3f;
+    ray.fbest = 2.3094e-4f;
+    ray.mode = DISTI_JUMP;
+    CHECK_EQUAL(1, disti_ray_open_bracket(&tracer, &ray, 0, 8.2277e-3f, 3.03e-2f, -7.0323e-3f));
+    CHECK(ray.a > 8e-3f && ray.fa < 2.4e-4f && ray.target > 2e-2f);
+    ray.mode = DISTI_BACK; /* warm start: best is of another picture */
+    CHECK_EQUAL(1, disti_ray_open_bracket(&tracer, &ray, 0, 8.2277e-3f, 3.03e-2f, -7.0323e-3f));
+    CHECK_NEAR(0, ray.a, 0);
+    for (int coarse = 0; coarse < 2; coarse++) { /* foretold was f = 0; hardly less than at the front, it is flat */
+        for (int fell = 0; fell < 2; fell++) {
+            how.epsilon = coarse ? 1e-2f : 1e-3f;
+            CHECK_STATUS(DIST_OK, disti_tracer_init(&tracer, ctx, &field, &how, "test"), ctx);
+            memset(&ray, 0, sizeof ray);
+            ray.sign = 1;
+            ray.base = 2;
+            ray.leave = 0.5f;
+            ray.f = fell ? 5.4e-2f : 5.54e-4f;
+            ray.fa = 3e38f;
+            ray.q = 9.4e-4f;
+            ray.incline = -0.889f;
+            ray.width = 4;
+            CHECK_EQUAL(fell ? 0 : 1, disti_ray_predicted(&tracer, &ray, 5.39e-4f));
+            CHECK(fell || (ray.mode != DISTI_PREDICT && ray.mode != DISTI_DONE));
+            CHECK(!fell || (ray.error >= 0.75f * how.epsilon && ray.error < how.epsilon + 5e-3f)); /* of one sample */
+        }
+    }
+    dist_context_destroy(ctx);
+}
+
+/* Against rays that step by at most f / 2.5. Without the rules above 31 holes, not 3. */
+TEST(the_default_tracer_loses_one_hit_in_ten_thousand_of_the_embedded_family)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(64, 64);
+    dist_net *net = dist_net_load_file(ctx, "examples/model.safetensors");
+    int holes = 0, hits = 0;
+    REQUIRE(net != NULL);
+    for (int code = 0; code < dist_net_code_count(net); code += test_quick() ? 12 : 3) {
+        dist_shape *shape = dist_shape_create(ctx, net, dist_net_code(net, code));
+        dist_field field = dist_shape_field(shape);
+        dist_render_desc how = plain_how();
+        CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, &how, &picture_a), ctx);
+        how.certified = 1;
+        field.lipschitz = 2.5f;
+        field.lipschitz_far = 0;
+        CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, &how, &picture_b), ctx);
+        for (int i = 0; i < 64 * 64; i++) {
+            hits += picture_b.mask[i];
+            holes += picture_b.mask[i] && !picture_a.mask[i];
+        }
+        dist_shape_destroy(shape);
+    }
+    if (test_state.verbose) printf("    %d holes for %d hits\n", holes, hits);
+    CHECK(hits > 10000 && holes <= 1 + hits / 10000);
+    dist_net_destroy(net);
     dist_context_destroy(ctx);
 }
 
@@ -1245,7 +1344,7 @@ TEST(error_bounds_hold_for_999_hits_of_1000)
     bound_check_shape(ctx, "torus of slope 2", &cases[4], &camera);
     bound_check_shape(ctx, "torus clamped at 0.1", &cases[5], &camera);
     bound_check_shape(ctx, "bumps", &cases[6], &camera);
-    for (int code = 0; code < 4; code++) bound_check_decoder(ctx, "examples/model.safetensors", 65 * code, 1);
+    for (int code = 0; code < 4; code++) bound_check_decoder(ctx, "examples/model.safetensors", 65 * code);
     dist_context_destroy(ctx);
 }
 
@@ -1265,7 +1364,7 @@ TEST(error_bounds_hold_for_999_hits_of_1000_of_real_decoders)
             continue;
         }
         (void)snprintf(file, sizeof file, "nets/%.*s.safetensors", dot ? (int)(dot - names[k]) : 31, names[k]);
-        bound_check_decoder(ctx, test_data_path(file), dot ? atoi(dot + 1) : -1, names[k][0] != 'm'); /* m: flat */
+        bound_check_decoder(ctx, test_data_path(file), dot ? atoi(dot + 1) : -1);
     }
     dist_context_destroy(ctx);
 }
@@ -1404,6 +1503,8 @@ int main(int argc, char **argv)
     RUN(a_slope_beyond_the_lipschitz_figure_is_reported);
     RUN(slopes_of_rings_beyond_those_sampled_are_reported);
     RUN(bounds_reach_to_where_f_was_foretold_to_cross_and_over_what_is_flat);
+    RUN(steps_that_may_have_gone_through_something_are_taken_back);
+    RUN(the_default_tracer_loses_one_hit_in_ten_thousand_of_the_embedded_family);
     RUN(error_bounds_hold_for_999_hits_of_1000);
     RUN(error_bounds_hold_for_999_hits_of_1000_of_real_decoders);
     RUN(depth_of_real_decoders_is_that_of_double);

@@ -110,10 +110,12 @@ static inline float *take_floats(size_t count)
 /* Wall clock, in seconds. */
 static inline double seconds_now(void)
 {
-#ifdef _WIN32
+#if defined(_WIN32) && defined(TIME_UTC)
     struct timespec now;
     timespec_get(&now, TIME_UTC);
     return (double)now.tv_sec + 1e-9 * (double)now.tv_nsec;
+#elif defined(_WIN32)
+    return (double)clock() / CLOCKS_PER_SEC; /* wall clock there, unlike elsewhere */
 #else
     struct timeval now;
     gettimeofday(&now, NULL);

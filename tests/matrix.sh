@@ -143,6 +143,13 @@ else
     skip_row aarch64 "aarch64-linux-gnu-gcc and qemu-aarch64 are not both installed"
 fi
 if [ -z "$quick" ]; then
+    wine=$(command -v wine64 || command -v wine || ls /usr/lib/wine/wine64 2>/dev/null)
+    if have x86_64-w64-mingw32-gcc && [ -n "$wine" ]; then
+        set -- $(basename -s .c tests/test_*.c)
+        row windows build/matrix/windows x86_64-w64-mingw32-gcc "-O2" "" 1 "env WINEDEBUG=-all $wine" "$@"
+    else
+        skip_row windows "x86_64-w64-mingw32-gcc and wine are not both installed"
+    fi
     echo '#include <stdlib.h>
 int main(void) { return malloc(1) == NULL; }' >build/matrix/probe32.c
     if gcc -m32 build/matrix/probe32.c -o build/matrix/probe32 2>/dev/null && build/matrix/probe32; then

@@ -37,9 +37,12 @@ if [ "$1" = --one ]; then # one job, started by the xargs below
         fi
         ;;
     *)
-        if [ -x "$folder/$name" ]; then
-            $limit $DIST_TEST_EMULATOR "$folder/$name" >"$log.log" 2>&1
+        program=$folder/$name
+        [ -x "$program" ] || [ ! -e "$program.exe" ] || program=$program.exe
+        if [ -x "$program" ]; then
+            $limit $DIST_TEST_EMULATOR "$program" >"$log.log" 2>&1
             status=$?
+            [ "$program" = "$folder/$name" ] || sed -i 's/\r$//' "$log.log"
             sum=$(sed -n 's/^\([0-9]*\) passed, \([0-9]*\) failed, \([0-9]*\) skipped$/\1 \2 \3/p' "$log.log" | tail -n 1)
         else
             echo "not ok $name: it did not build" >"$log.log"

@@ -6028,6 +6028,11 @@ enum {
     DISTI_SORTED = 8 * (int)DISTI_GROUP_POINTS /* points put in order at once */
 };
 
+typedef struct disti_place { /* a point, and which it is */
+    float p[3];
+    int at;
+} disti_place;
+
 typedef struct disti_group {
     float *x[2];     /* (GROUP, width, B): a layer's input: rows of the units that are computed, then the point's */
     float *point, *away; /* (GROUP, 3, B): the points, and from the group's center */
@@ -6039,7 +6044,7 @@ typedef struct disti_group {
     int *alive;      /* (GROUP, max_rows): rows of x alive in the block */
     int *unit[2];    /* (max_rows): which unit each row of x is */
     int *list;       /* (max_rows): which columns of the layer's weights the rows of x are */
-    int *order;      /* DISTI_SORTED */
+    disti_place *place; /* DISTI_SORTED: points in order */
     float *points;   /* (GROUP_POINTS, 3), in that order */
     size_t width, panel_size; /* room for three quarters of all units, of the weights for a third */
     float cell[6 * DISTI_CELLS], center[3], half[3];
@@ -6068,7 +6073,7 @@ static size_t disti_group_layout(const dist_net *net, unsigned char *base, const
     g->mask = (uint64_t *)disti_take(base, &at, DISTI_GROUP * rows, sizeof(uint64_t));
     g->alive = (int *)disti_take(base, &at, DISTI_GROUP * rows, sizeof(int));
     g->list = (int *)disti_take(base, &at, rows, sizeof(int));
-    g->order = (int *)disti_take(base, &at, DISTI_SORTED, sizeof(int));
+    g->place = (disti_place *)disti_take(base, &at, DISTI_SORTED, sizeof(disti_place));
     g->points = (float *)disti_take(base, &at, DISTI_GROUP_POINTS * 3, sizeof(float));
     return at;
 }
@@ -6082,42 +6087,68 @@ static int disti_net_groups(const dist_context *ctx, const dist_net *net)
            narrow >= 96 && net->max_rows <= 1100 && (!ctx->blas.sgemm_fn || narrow < ctx->blas_width);
 }
 
-/* Puts order[begin..end-1] such that neighbors stand together: cut across the longest side of their box, in whole
+static void disti_places_init(disti_place *place, const float *points, int n)
+{
+    for (int i = 0; i < n; i++) {
+        memcpy(place[i].p, points + 3 * i, 3 * sizeof(float));
+        place[i].at = i;
+    }
+}
+
+/* The axis along which n places reach farthest. */
+static int disti_places_axis(const disti_place *place, int n)
+{
+    float x0 = 3e38f, y0 = 3e38f, z0 = 3e38f, x1 = -3e38f, y1 = -3e38f, z1 = -3e38f;
+    for (int i = 0; i < n; i++) {
+        const float *p = place[i].p;
+        x0 = DISTI_MIN(x0, p[0]), x1 = DISTI_MAX(x1, p[0]);
+        y0 = DISTI_MIN(y0, p[1]), y1 = DISTI_MAX(y1, p[1]);
+        z0 = DISTI_MIN(z0, p[2]), z1 = DISTI_MAX(z1, p[2]);
+    }
+    return x1 - x0 >= y1 - y0 ? (x1 - x0 >= z1 - z0 ? 0 : 2) : y1 - y0 >= z1 - z0 ? 1 : 2;
+}
+
+/* Puts those of place[a..b] below the limit, or also those at it, before the others; returns where these begin. Without
+   a branch on what is compared, which no processor could foretell. */
+static int disti_places_part(disti_place *place, int a, int b, int axis, float limit, int also)
+{
+    int to = a;
+    for (int i = a; i <= b; i++) {
+        disti_place moved = place[i];
+        float x = moved.p[axis];
+        place[i] = place[to];
+        place[to] = moved;
+        to += (x < limit) | (also & (x <= limit));
+    }
+    return to;
+}
+
+/* Puts place[begin..end-1] such that neighbors stand together: cut across the longest side of their box, in whole
    groups, blocks, cells. */
-static void disti_sort_points(const float *points, int *order, int begin, int end)
+static void disti_sort_places(disti_place *place, int begin, int end)
 {
     while (end - begin > DISTI_CELL_POINTS) {
-        float low[3] = {3e38f, 3e38f, 3e38f}, high[3] = {-3e38f, -3e38f, -3e38f};
-        int n = end - begin, axis = 0;
+        int n = end - begin, axis = disti_places_axis(place + begin, n);
         int unit = n > DISTI_GROUP_POINTS ? (int)DISTI_GROUP_POINTS
                    : n > DISTI_BLOCK      ? (int)DISTI_BLOCK
                                           : (int)DISTI_CELL_POINTS;
-        for (int i = begin; i < end; i++) {
-            for (int k = 0; k < 3; k++) {
-                float x = points[3 * order[i] + k];
-                low[k] = DISTI_MIN(low[k], x);
-                high[k] = DISTI_MAX(high[k], x);
-            }
-        }
-        for (int k = 1; k < 3; k++) axis = high[k] - low[k] > high[axis] - low[axis] ? k : axis;
         int middle = begin + (n / unit + 1) / 2 * unit, a = begin, b = end - 1;
         if (middle >= end) middle = end - unit;
-        while (a < b) { /* Hoare's selection of the element at `middle` */
-            float pivot = points[3 * order[(a + b) / 2] + axis];
-            int i = a, j = b;
-            while (i <= j) {
-                while (points[3 * order[i] + axis] < pivot) i++;
-                while (points[3 * order[j] + axis] > pivot) j--;
-                if (i > j) break;
-                int swap = order[i];
-                order[i++] = order[j];
-                order[j--] = swap;
+        while (a < b) { /* selection of the place at `middle`, by the median of three */
+            float x = place[a].p[axis], y = place[a + (b - a) / 2].p[axis], z = place[b].p[axis];
+            float limit = DISTI_MAX(DISTI_MIN(x, y), DISTI_MIN(DISTI_MAX(x, y), z));
+            int from = disti_places_part(place, a, b, axis, limit, 0);
+            if (middle < from) {
+                b = from - 1;
+                continue;
             }
-            if (middle <= j) b = j;
-            else if (middle >= i) a = i;
-            else break;
+            if (from == a) { /* it is the least: those alike stand first */
+                from = disti_places_part(place, a, b, axis, limit, 1);
+                if (middle < from || from == a) break; /* the latter: not finite */
+            }
+            a = from;
         }
-        disti_sort_points(points, order, begin, middle);
+        disti_sort_places(place, begin, middle);
         begin = middle;
     }
 }
@@ -6349,16 +6380,16 @@ static void disti_groups_eval(void *user, int worker, size_t n, const float *poi
     disti_group_layout(shape->net, disti_lane(shape->ctx, worker) + bytes, &b, &g);
     for (size_t at = 0; at < n; at += DISTI_SORTED) {
         int count = (int)DISTI_MIN(n - at, (size_t)DISTI_SORTED);
-        for (int i = 0; i < count; i++) g.order[i] = i;
-        disti_sort_points(points + 3 * at, g.order, 0, count);
+        disti_places_init(g.place, points + 3 * at, count);
+        disti_sort_places(g.place, 0, count);
         for (int first = 0; first < count; first += DISTI_GROUP_POINTS) {
             int part = DISTI_MIN(count - first, (int)DISTI_GROUP_POINTS);
-            for (int i = 0; i < part; i++)
-                memcpy(g.points + 3 * i, points + 3 * (at + (size_t)g.order[first + i]), 3 * sizeof(float));
+            const disti_place *place = g.place + first;
+            for (int i = 0; i < part; i++) memcpy(g.points + 3 * i, place[i].p, 3 * sizeof(float));
             int few = n <= 2 * DISTI_GROUP_POINTS || part <= 2 * DISTI_BLOCK; /* bounds cost more than they save */
             if (few || !disti_group_eval(shape, worker, &g, &b, part, g.points, value))
                 disti_shape_fused(user, worker, (size_t)part, g.points, value, NULL, NULL, NULL, NULL);
-            for (int i = 0; i < part; i++) sdf[at + (size_t)g.order[first + i]] = value[i];
+            for (int i = 0; i < part; i++) sdf[at + (size_t)place[i].at] = value[i];
         }
     }
 }
@@ -12188,16 +12219,14 @@ static void disti_add_pull(disti_render_backward_job *job, const double p[3], co
 static void disti_backward_sort(disti_render_backward_job *job)
 {
     const dist_tape *tape = job->tape;
-    float *points = disti_chunk_scratch(job->ctx);
-    disti_entry *entry = (disti_entry *)(void *)(points + 3 * DISTI_CHUNK);
-    int *order = (int *)(void *)(entry + DISTI_CHUNK);
-    for (size_t i = 0; i < job->count; i++) order[i] = (int)i;
-    disti_sort_points(tape->points, order, 0, (int)job->count);
-    memcpy(points, tape->points, 3 * job->count * sizeof(float));
+    disti_place *place = (disti_place *)(void *)disti_chunk_scratch(job->ctx);
+    disti_entry *entry = (disti_entry *)(void *)(place + DISTI_CHUNK);
+    disti_places_init(place, tape->points, (int)job->count);
+    disti_sort_places(place, 0, (int)job->count);
     memcpy(entry, tape->entry, job->count * sizeof *entry);
     for (size_t i = 0; i < job->count; i++) {
-        memcpy(tape->points + 3 * i, points + 3 * order[i], 3 * sizeof(float));
-        tape->entry[i] = entry[order[i]];
+        memcpy(tape->points + 3 * i, place[i].p, 3 * sizeof(float));
+        tape->entry[i] = entry[place[i].at];
     }
 }
 

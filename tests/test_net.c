@@ -307,6 +307,51 @@ TEST(a_point_has_the_same_bits_in_every_batch)
     }
 }
 
+/* Every point once, whatever they are: in a box, on a line, at a few places only, all alike, not finite. Each cell is
+   small where they are spread out, and what ends a group lies on one side of what begins the next. */
+TEST(points_put_in_order_are_all_there_and_neighbors_stand_together)
+{
+    enum { MOST = 3000, CELL = DISTI_CELL_POINTS };
+    static float points[3 * MOST];
+    static disti_place place[MOST];
+    static unsigned char seen[MOST];
+    const int counts[] = {0, 1, 2, CELL, CELL + 1, DISTI_BLOCK + 1, DISTI_GROUP_POINTS, 1000, MOST};
+    test_random r = test_random_seed(11);
+    for (int kind = 0; kind < 5; kind++) {
+        for (size_t c = 0; c < sizeof counts / sizeof counts[0]; c++) {
+            int n = counts[c], once = 1;
+            double extent = 0;
+            for (int i = 0; i < 3 * n; i++) {
+                float x = test_random_float(&r, -1, 1);
+                points[i] = kind == 0                ? x
+                            : kind == 1              ? (i % 3 == 1 ? x : 0.0f)
+                            : kind == 2              ? floorf(2 * x)
+                            : kind == 4 && i % 7 < 3 ? (i % 2 ? NAN : INFINITY)
+                                                     : 0.25f;
+            }
+            memset(seen, 0, sizeof seen);
+            disti_places_init(place, points, n);
+            disti_sort_places(place, 0, n);
+            for (int i = 0; i < n; i++) {
+                once &= place[i].at >= 0 && place[i].at < n && !seen[place[i].at]++;
+                once &= memcmp(place[i].p, points + 3 * place[i].at, 3 * sizeof(float)) == 0;
+            }
+            CHECK(once);
+            for (int at = 0; at + CELL <= n && kind == 0; at += CELL) {
+                for (int k = 0; k < 3; k++) {
+                    float low = 2, high = -2;
+                    for (int i = at; i < at + CELL; i++) {
+                        low = fminf(low, place[i].p[k]);
+                        high = fmaxf(high, place[i].p[k]);
+                    }
+                    extent += (double)(high - low) / (3.0 * n / CELL);
+                }
+            }
+            if (kind == 0 && n == MOST) CHECK(extent < 0.4); /* 2 / 250^(1/3) = 0.32; 1.7 in any order */
+        }
+    }
+}
+
 TEST(a_dead_unit_that_is_left_out_changes_no_bit)
 {
     for (int normed = 0; normed < 2; normed++) {
@@ -1181,6 +1226,7 @@ int main(int argc, char **argv)
     RUN(setting_a_code_equals_making_the_shape_with_it);
     RUN(operations_of_a_net_are_its_multiply_adds);
     RUN(a_point_has_the_same_bits_in_every_batch);
+    RUN(points_put_in_order_are_all_there_and_neighbors_stand_together);
     RUN(a_dead_unit_that_is_left_out_changes_no_bit);
     RUN(rows_that_are_left_out_change_no_bit);
     RUN(a_saved_net_loads_and_saves_to_the_same_bytes_and_values);

@@ -6124,12 +6124,12 @@ static int disti_places_part(disti_place *place, int a, int b, int axis, float l
 }
 
 /* Puts place[begin..end-1] such that neighbors stand together: cut across the longest side of their box, in whole
-   groups, blocks, cells. */
-static void disti_sort_places(disti_place *place, int begin, int end)
+   groups, blocks, cells. least: as far as pieces of so many, a multiple of a group's or a cell's number. */
+static void disti_sort_places(disti_place *place, int begin, int end, int least)
 {
-    while (end - begin > DISTI_CELL_POINTS) {
+    while (end - begin > least) {
         int n = end - begin, axis = disti_places_axis(place + begin, n);
-        int unit = n > DISTI_GROUP_POINTS ? (int)DISTI_GROUP_POINTS
+        int unit = n > DISTI_GROUP_POINTS ? DISTI_MAX((int)DISTI_GROUP_POINTS, least)
                    : n > DISTI_BLOCK      ? (int)DISTI_BLOCK
                                           : (int)DISTI_CELL_POINTS;
         int middle = begin + (n / unit + 1) / 2 * unit, a = begin, b = end - 1;
@@ -6148,7 +6148,7 @@ static void disti_sort_places(disti_place *place, int begin, int end)
             }
             a = from;
         }
-        disti_sort_places(place, begin, middle);
+        disti_sort_places(place, begin, middle, least);
         begin = middle;
     }
 }
@@ -6381,7 +6381,7 @@ static void disti_groups_eval(void *user, int worker, size_t n, const float *poi
     for (size_t at = 0; at < n; at += DISTI_SORTED) {
         int count = (int)DISTI_MIN(n - at, (size_t)DISTI_SORTED);
         disti_places_init(g.place, points + 3 * at, count);
-        disti_sort_places(g.place, 0, count);
+        disti_sort_places(g.place, 0, count, DISTI_CELL_POINTS);
         for (int first = 0; first < count; first += DISTI_GROUP_POINTS) {
             int part = DISTI_MIN(count - first, (int)DISTI_GROUP_POINTS);
             const disti_place *place = g.place + first;
@@ -12197,6 +12197,7 @@ static void disti_add_pull(disti_render_backward_job *job, const double p[3], co
 {
     const disti_view *view = &job->view;
     double q[3], pull[3], torque[3], e[2];
+    if (!job->camera) return;
     disti_rotate(view->rotation, p, q);
     disti_rotate(view->rotation, y, pull);
     disti_cross(q, pull, torque);
@@ -12215,19 +12216,33 @@ static void disti_add_pull(disti_render_backward_job *job, const double p[3], co
     }
 }
 
-/* Puts the entries in such order that the blocks of a field that likes many points hold neighbors. */
-static void disti_backward_sort(disti_render_backward_job *job)
+/* Pieces that the entries are cut into before each is put in order by itself. */
+enum { DISTI_PIECE = 4 * (int)DISTI_GROUP_POINTS };
+
+static void disti_backward_sort_task(void *arg, int index, int worker)
 {
+    const disti_render_backward_job *job = (const disti_render_backward_job *)arg;
     const dist_tape *tape = job->tape;
     disti_place *place = (disti_place *)(void *)disti_chunk_scratch(job->ctx);
-    disti_entry *entry = (disti_entry *)(void *)(place + DISTI_CHUNK);
-    disti_places_init(place, tape->points, (int)job->count);
-    disti_sort_places(place, 0, (int)job->count);
-    memcpy(entry, tape->entry, job->count * sizeof *entry);
-    for (size_t i = 0; i < job->count; i++) {
+    const disti_entry *entry = (const disti_entry *)(const void *)(place + DISTI_CHUNK);
+    int begin = index * DISTI_PIECE, end = DISTI_MIN(begin + DISTI_PIECE, (int)job->count);
+    (void)worker;
+    disti_sort_places(place, begin, end, DISTI_CELL_POINTS);
+    for (int i = begin; i < end; i++) {
         memcpy(tape->points + 3 * i, place[i].p, 3 * sizeof(float));
         tape->entry[i] = entry[place[i].at];
     }
+}
+
+/* Puts the entries in such order that the blocks of a field that likes many points hold neighbors. */
+static void disti_backward_sort(disti_render_backward_job *job)
+{
+    disti_place *place = (disti_place *)(void *)disti_chunk_scratch(job->ctx);
+    int count = (int)job->count;
+    disti_places_init(place, job->tape->points, count);
+    memcpy(place + DISTI_CHUNK, job->tape->entry, job->count * sizeof(disti_entry));
+    disti_sort_places(place, 0, count, DISTI_PIECE);
+    disti_run(job->ctx, (count + DISTI_PIECE - 1) / DISTI_PIECE, disti_backward_sort_task, job);
 }
 
 /* Runs the adjoint over the entries gathered so far. */
@@ -12309,6 +12324,7 @@ static void disti_backward_pixel(disti_render_backward_job *job, size_t pixel, f
     double local[3], nearest[3], pull[3];
     float p[3];
     int paper = tracer->how.gradient == DIST_GRADIENT_PAPER;
+    if (!job->camera && !(status & (DISTI_TAPE_HIT | DISTI_TAPE_SAMPLE))) return; /* off the sphere, most often */
     disti_tape_ray(job, pixel, local, &ray, p);
     if (ray.enter >= ray.leave) { /* off the sphere: only the camera feels it */
         disti_ray_nearest(field, &ray, nearest, pull);

@@ -331,7 +331,7 @@ TEST(points_put_in_order_are_all_there_and_neighbors_stand_together)
             }
             memset(seen, 0, sizeof seen);
             disti_places_init(place, points, n);
-            disti_sort_places(place, 0, n);
+            disti_sort_places(place, 0, n, CELL);
             for (int i = 0; i < n; i++) {
                 once &= place[i].at >= 0 && place[i].at < n && !seen[place[i].at]++;
                 once &= memcmp(place[i].p, points + 3 * place[i].at, 3 * sizeof(float)) == 0;

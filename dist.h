@@ -232,7 +232,7 @@ typedef struct dist_field {
 
 /* f = distance to a sphere, to a torus around the y axis, to an axis-aligned box (half extents), exact; each within its
    bounding sphere. Their code is the list of numbers given, in that order, so that gradients can be tried on them.
-   The arrays are borrowed while the field is used. */
+   The arrays are borrowed while the field is used. A size below 0 becomes field.radius, which every call refuses. */
 DIST_API dist_field dist_field_sphere(const float center_radius[4]);
 DIST_API dist_field dist_field_torus(const float center_radii[5]); /* x y z, ring radius, tube radius */
 DIST_API dist_field dist_field_box(const float center_half[6]);    /* x y z, half extents */
@@ -3190,6 +3190,8 @@ static void disti_analytic_adjoint(disti_point_fn point_fn, int size, void *user
         field.adjoint_fn = disti_##name##_adjoint;                                                                     \
         memcpy(field.center, c, sizeof field.center);                                                                  \
         field.radius = 1.1f * (extent);                                                                                \
+        for (int i = 3; i < size; i++)                                                                                 \
+            if (!(c[i] >= 0.0f)) field.radius = c[i]; /* no size: refused wherever the field is used */                \
         field.lipschitz = 1.0f;                                                                                        \
         field.code_size = size;                                                                                        \
         return field;                                                                                                  \

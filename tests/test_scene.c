@@ -967,6 +967,29 @@ static int refused(dist_context *ctx, const dist_instance *instance, const char 
     return good;
 }
 
+/* A box with two half extents below 0 was the outside of nothing, a ring thinner than none a smaller ring. */
+TEST(sizes_below_zero_are_refused_and_a_plate_of_no_thickness_is_not)
+{
+    dist_context *ctx = test_context();
+    const float sphere[4] = {0, 0, 0, -1}, torus[5] = {0, 0, 0, 0.5f, -0.1f}, box[6] = {0, 0, 0, 0.5f, -0.3f, 0.4f};
+    const float none[4] = {0, 0, 0, NAN}, plate[6] = {0, 0, 0, 0.5f, 0, 0.5f}, p[3] = {0, 0.25f, 0};
+    dist_field wrong[4];
+    float f = 0;
+    wrong[0] = dist_field_sphere(sphere);
+    wrong[1] = dist_field_torus(torus);
+    wrong[2] = dist_field_box(box);
+    wrong[3] = dist_field_sphere(none);
+    for (int i = 0; i < 4; i++) {
+        CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_eval(ctx, &wrong[i], 1, p, &f, NULL), ctx);
+        if (i == 2) CHECK_TEXT("field.radius is -0.3, must be", dist_context_message(ctx));
+        dist_context_clear(ctx);
+    }
+    dist_field right = dist_field_box(plate);
+    CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &right, 1, p, &f, NULL), ctx);
+    CHECK_NEAR(0.25, f, 1e-6);
+    dist_context_destroy(ctx);
+}
+
 /* Squares of such lengths do not fit a float: a sphere of 1e-20 rendered as nothing at all, without a word. */
 TEST(radii_that_floats_cannot_square_are_refused)
 {
@@ -1222,6 +1245,7 @@ int main(int argc, char **argv)
     RUN(a_placement_is_found_from_a_picture_alone_and_with_the_code);
     RUN(a_pixel_pulls_on_the_instance_that_it_shows_alone);
     RUN(moving_a_placement_keeps_it_a_similarity);
+    RUN(sizes_below_zero_are_refused_and_a_plate_of_no_thickness_is_not);
     RUN(radii_that_floats_cannot_square_are_refused);
     RUN(scenes_refuse_what_cannot_be_placed);
     RUN(what_is_not_finite_stays_so);

@@ -10619,6 +10619,9 @@ struct dist_tape {
     float *value, *start, *nearest, *beside;
     disti_cone *cones;      /* warm start: all of the picture, asked for beside those of other tiles */
     unsigned turn;          /* warm renders so far */
+    unsigned *cost;         /* of the last picture's tiles: queries */
+    int *order;             /* of the tiles: first those that cost most then */
+    int tiled;              /* the size of these tiles; 0: there are none */
     int rendered, has_silhouette;
     dist_field field;
     dist_camera camera;
@@ -10639,6 +10642,12 @@ static int disti_tile_cones(int tile)
 {
     int across = (tile + (int)DISTI_CONE_FIRST - 1) / (int)DISTI_CONE_FIRST;
     return across * across * 16 + 1;
+}
+
+/* The smallest tiles of a picture, the paper's tracer's apart: it should have some for every worker. */
+static int disti_tile_least(int width, int height)
+{
+    return (double)width * (double)height < 384.0 * 384.0 ? (int)DISTI_TILE_USUAL / 2 : (int)DISTI_TILE_USUAL;
 }
 
 static size_t disti_picture_cones(int width, int height)
@@ -10667,6 +10676,10 @@ static size_t disti_tape_layout(dist_tape *tape, unsigned char *base, int warm)
         size_t cones = disti_picture_cones(tape->width, tape->height);
         tape->cones = (disti_cone *)disti_take(base, &at, cones, sizeof(disti_cone));
     }
+    int tile = disti_tile_least(tape->width, tape->height);
+    size_t tiles = (size_t)((tape->width - 1) / tile + 1) * (size_t)((tape->height - 1) / tile + 1);
+    tape->cost = (unsigned *)disti_take(base, &at, tiles, sizeof(unsigned));
+    tape->order = (int *)disti_take(base, &at, tiles, sizeof(int));
     tape->entry = (disti_entry *)disti_take(base, &at, each, sizeof(disti_entry));
     tape->points = (float *)disti_take(base, &at, each, three);
     tape->d_sdf = (float *)disti_take(base, &at, each, sizeof(float));
@@ -10756,6 +10769,8 @@ typedef struct disti_render_job {
     size_t first[DISTI_LIST_TASKS + 1]; /* disti_render_list: first pixel of each task */
     size_t each;                        /* and how many of them each has */
     int count;                          /* tasks */
+    const int *order;                   /* NULL: the tiles as they stand */
+    unsigned *cost;                     /* NULL, or what each tile costs goes here */
     int box[4];  /* left, top, right, bottom: pixels that may see the bounding sphere */
 } disti_render_job;
 
@@ -11879,6 +11894,26 @@ static void disti_cones_task(void *arg, int index, int worker)
     for (int i = 0; i < count; i++) to[i]->size = 0;
 }
 
+/* Lists the tiles of a picture like the last one by what they cost then, the most costly first, to a 64th of that: the
+   workers are all done at about the same time. */
+static void disti_render_order(disti_render_job *job)
+{
+    enum { STEPS = 64 };
+    const dist_tape *tape = job->tape;
+    int first[STEPS + 1];
+    unsigned most = 1;
+    job->order = NULL;
+    job->cost = tape && job->tracer->how.trace == DIST_TRACE_GUARDED ? tape->cost : NULL;
+    if (!job->cost || !tape->rendered || tape->tiled != job->tile || job->tracer->ctx->workers == 1) return;
+    for (int i = 0; i < job->count; i++) most = DISTI_MAX(most, tape->cost[i]);
+    memset(first, 0, sizeof first);
+    for (int i = 0; i < job->count; i++) first[STEPS - (int)((STEPS - 1) * (double)tape->cost[i] / most)]++;
+    for (int k = 1; k <= STEPS; k++) first[k] += first[k - 1];
+    for (int i = 0; i < job->count; i++)
+        tape->order[first[STEPS - 1 - (int)((STEPS - 1) * (double)tape->cost[i] / most)]++] = i;
+    job->order = tape->order;
+}
+
 static void disti_render_task(void *arg, int index, int worker)
 {
     const disti_render_job *job = (const disti_render_job *)arg;
@@ -11886,6 +11921,8 @@ static void disti_render_task(void *arg, int index, int worker)
     disti_bench bench;
     disti_tile tile;
     disti_bench_init(tracer->ctx, worker, &bench);
+    unsigned long long before = bench.stats->queries;
+    if (job->order) index = job->order[index];
     disti_tile_init(job, index, &tile);
     disti_budget budget;
     disti_render_budget(job, &tile, &budget);
@@ -11937,6 +11974,7 @@ static void disti_render_task(void *arg, int index, int worker)
     }
     disti_render_planes(job, worker, &tile, &bench);
     if (tile.lazy) bench.stats->rays_in_sphere = met; /* planes counts only those that were made */
+    if (job->cost) job->cost[index] = (unsigned)(bench.stats->queries - before);
 }
 
 /* Pixels that stand alone have no neighbors to share cones and predictions with: their rays, and no others, are packed
@@ -12081,10 +12119,8 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     job.lazy = !job.least && !tape && !tracer.how.pixels && !tracer.how.no_cones &&
                tracer.how.trace == DIST_TRACE_GUARDED;
     job.cheap = job.lazy && field->cost > 0.0f && field->cost < 5000.0f;
-    job.tile = tracer.how.trace == DIST_TRACE_PAPER || (double)view.width * view.height < 384.0 * 384.0
-                   ? DISTI_TILE_USUAL / 2
-               : field->many || job.cheap ? DISTI_TILE
-                                          : DISTI_TILE_USUAL;
+    job.tile = tracer.how.trace == DIST_TRACE_PAPER ? DISTI_TILE_USUAL / 2 : disti_tile_least(view.width, view.height);
+    if (job.tile == DISTI_TILE_USUAL && (field->many || job.cheap)) job.tile = DISTI_TILE;
     job.across = (view.width + job.tile - 1) / job.tile;
     int listed = disti_render_list(&tracer, &view, &job);
     job.count = listed ? listed : job.across * ((view.height + job.tile - 1) / job.tile);
@@ -12096,10 +12132,12 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     if (job.warm) disti_run(ctx, (view.height + DISTI_TILE - 1) / DISTI_TILE, disti_nearest_task, &job);
     job.coned = job.warm && job.predict && !tracer.how.pixels && tracer.how.max_queries == 0;
     if (job.coned) disti_run(ctx, (job.count + DISTI_CONE_TILES - 1) / DISTI_CONE_TILES, disti_cones_task, &job);
+    if (!listed) disti_render_order(&job);
     disti_run(ctx, job.count, listed ? disti_render_list_task : disti_render_task, &job);
     disti_stats_end(ctx, &tracer, out->stats);
     if (!tape) return DIST_OK;
     tape->rendered = 1;
+    tape->tiled = listed ? 0 : job.tile;
     tape->has_silhouette = job.least;
     tape->field = *field;
     tape->camera = *camera;

@@ -1226,6 +1226,46 @@ TEST(bounds_reach_to_where_f_was_foretold_to_cross_and_over_what_is_flat)
     dist_context_destroy(ctx);
 }
 
+/* The second picture on a tape begins with the tiles that cost most in the first; whoever traces them, whenever, the
+   picture is the same. */
+TEST(tiles_that_cost_most_last_time_come_first_and_change_nothing)
+{
+    enum { WIDTH = 230, HEIGHT = 150 };
+    static float depth[3][WIDTH * HEIGHT];
+    test_shape shape = shape_make(SHAPE_TORUS, 0.6, 0.25, 0, 0);
+    dist_field field = shape_field(&shape, 1, 1.125);
+    dist_camera camera = shape_camera(WIDTH, HEIGHT);
+    for (int k = 0; k < 2; k++) {
+        test_scheduler scheduler;
+        dist_context_desc desc = test_context_desc();
+        dist_images out;
+        scheduler.calls = 0;
+        scheduler.workers = desc.workers = 1 + 2 * k;
+        desc.scheduler = test_scheduler_hook(&scheduler);
+        dist_context *ctx = dist_context_create(&desc);
+        dist_tape *tape = dist_tape_create(ctx, &camera, NULL);
+        REQUIRE(tape != NULL);
+        memset(&out, 0, sizeof out);
+        for (int turn = 0; turn < 2; turn++) {
+            out.depth = depth[k == 0 ? 0 : 1 + turn];
+            CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, tape), ctx);
+        }
+        int tiles = ((WIDTH - 1) / tape->tiled + 1) * ((HEIGHT - 1) / tape->tiled + 1), seen = 0;
+        unsigned most = k == 1 ? tape->cost[tape->order[0]] : 0, last = most;
+        for (int i = 0; k == 1 && i < tiles; i++) {
+            unsigned cost = tape->cost[tape->order[i]];
+            CHECK(cost <= last + most / 60);
+            last = cost;
+            for (int j = 0; j < tiles; j++) seen += tape->order[j] == i;
+        }
+        CHECK(k == 0 || (tiles > 8 && seen == tiles && most > 0 && last < most / 2));
+        dist_tape_destroy(tape);
+        dist_context_destroy(ctx);
+    }
+    CHECK_BYTES(sizeof depth[0], depth[0], depth[1]);
+    CHECK_BYTES(sizeof depth[0], depth[0], depth[2]);
+}
+
 /* What rays of decoders went through: a jump by two samples ended where f was 3e-5, not .0075 as foretold, behind a
    wall; one ended at about what was foretold, but from there f rose as from a crossing before it. A sample that a jump
    brought, and the check took back, is where the bracket begins: f was flat from there on. */
@@ -1503,6 +1543,7 @@ int main(int argc, char **argv)
     RUN(a_slope_beyond_the_lipschitz_figure_is_reported);
     RUN(slopes_of_rings_beyond_those_sampled_are_reported);
     RUN(bounds_reach_to_where_f_was_foretold_to_cross_and_over_what_is_flat);
+    RUN(tiles_that_cost_most_last_time_come_first_and_change_nothing);
     RUN(steps_that_may_have_gone_through_something_are_taken_back);
     RUN(the_default_tracer_loses_one_hit_in_ten_thousand_of_the_embedded_family);
     RUN(error_bounds_hold_for_999_hits_of_1000);

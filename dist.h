@@ -104,7 +104,8 @@ typedef struct dist_allocator {
 
 /* Parallelism. run_fn calls task_fn(arg, index, worker) once for every index in 0..count-1, in any order, and returns
    when all are done. `worker` is 0..dist_context_desc.workers-1 and no two calls with one worker overlap.
-   task_fn never calls back into run_fn. NULL: OpenMP when the compiler has it on, else serial. */
+   Fastest: each worker takes the next index when it is done with one; costs differ, and the largest come first where
+   they are known. task_fn never calls back into run_fn. NULL: OpenMP when the compiler has it on, else serial. */
 typedef void (*dist_task_fn)(void *arg, int index, int worker);
 typedef struct dist_scheduler {
     void *user;
@@ -6126,7 +6127,7 @@ static int disti_places_part(disti_place *place, int a, int b, int axis, float l
 }
 
 /* Puts place[begin..end-1] such that neighbors stand together: cut across the longest side of their box, in whole
-   groups, blocks, cells. least: as far as pieces of so many, a multiple of a group's or a cell's number. */
+   groups, blocks, cells. Pieces of `least` places, a cell's or a multiple of a group's, are left as they are. */
 static void disti_sort_places(disti_place *place, int begin, int end, int least)
 {
     while (end - begin > least) {

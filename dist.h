@@ -593,6 +593,8 @@ typedef struct dist_images {
     float *error;          /* bound on the error of distance, as good as f's slopes are sampled; 0 where that is the
                               background. Behind the edge of a nearer surface it reaches to that; with
                               how.certified only where a slope beyond the Lipschitz figure was met in the same tile.
+                              With field.coarse_fn for eval_fn field.coarse_error is counted in; where a ray just
+                              meets or just passes an edge, it may be on the other side of it.
                               DIST_TRACE_PAPER: |f| of a hit's sample, no bound */
     dist_stats *stats;
 } dist_images;
@@ -9321,13 +9323,21 @@ static void disti_stats_end(dist_context *ctx, const disti_tracer *tracer, dist_
     out->lipschitz = tracer->lipschitz;
 }
 
-/* What is told of the error: the distance goes out as a float, which rounds off up to 2^-24 of it. */
+/* What is told of the error: the distance goes out as a float, which rounds off up to 2^-24 of it; and where f is off
+   by coarse_error, its zero is by that over the slope, which is the exact f's: two samples of a field that is rough by
+   that much tell of none above half the Lipschitz figure. */
 static float disti_ray_bound(const disti_tracer *tracer, const disti_ray *ray)
 {
-    double distance = ray->base + (double)ray->best;
+    const dist_field *field = tracer->field;
+    double distance = ray->base + (double)ray->best, coarse = 0.0;
     if (tracer->how.trace == DIST_TRACE_PAPER) return ray->error; /* |f|, no bound */
     if (ray->status != DIST_RAY_HIT && ray->status != DIST_RAY_UNRESOLVED) return ray->error;
-    return (float)((double)ray->error + 6e-8 * fabs(distance));
+    if (field->coarse_fn && field->eval_fn == field->coarse_fn) {
+        float slope = ray->slope < 0.0f ? -ray->slope : ray->slope, most = 0.5f * tracer->lipschitz;
+        slope = slope > 0.0f && slope < most ? DISTI_MAX(slope, 0.06f * tracer->lipschitz) : most;
+        coarse = (double)field->coarse_error / (double)slope;
+    }
+    return (float)((double)ray->error + coarse + 6e-8 * fabs(distance));
 }
 
 static void disti_stats_ray(const disti_tracer *tracer, const disti_ray *ray, dist_stats *stats)

@@ -11905,23 +11905,29 @@ static void disti_cones_task(void *arg, int index, int worker)
     for (int i = 0; i < count; i++) to[i]->size = 0;
 }
 
+enum { DISTI_RANKS = 64 };
+
+/* 0: about the most, DISTI_RANKS - 1: next to nothing. */
+static int disti_cost_rank(unsigned cost, unsigned most)
+{
+    return DISTI_RANKS - 1 - (int)((DISTI_RANKS - 1) * (double)cost / most);
+}
+
 /* Lists the tiles of a picture like the last one by what they cost then, the most costly first, to a 64th of that: the
    workers are all done at about the same time. */
 static void disti_render_order(disti_render_job *job)
 {
-    enum { STEPS = 64 };
     const dist_tape *tape = job->tape;
-    int first[STEPS + 1];
+    int first[DISTI_RANKS + 1]; /* the place of each rank's first tile */
     unsigned most = 1;
     job->order = NULL;
     job->cost = tape && job->tracer->how.trace == DIST_TRACE_GUARDED ? tape->cost : NULL;
     if (!job->cost || !tape->rendered || tape->tiled != job->tile || job->tracer->ctx->workers == 1) return;
     for (int i = 0; i < job->count; i++) most = DISTI_MAX(most, tape->cost[i]);
     memset(first, 0, sizeof first);
-    for (int i = 0; i < job->count; i++) first[STEPS - (int)((STEPS - 1) * (double)tape->cost[i] / most)]++;
-    for (int k = 1; k <= STEPS; k++) first[k] += first[k - 1];
-    for (int i = 0; i < job->count; i++)
-        tape->order[first[STEPS - 1 - (int)((STEPS - 1) * (double)tape->cost[i] / most)]++] = i;
+    for (int i = 0; i < job->count; i++) first[1 + disti_cost_rank(tape->cost[i], most)]++;
+    for (int k = 1; k <= DISTI_RANKS; k++) first[k] += first[k - 1];
+    for (int i = 0; i < job->count; i++) tape->order[first[disti_cost_rank(tape->cost[i], most)]++] = i;
     job->order = tape->order;
 }
 

@@ -271,6 +271,13 @@ TEST(another_instruction_set_has_no_coarse_fn)
     dist_context_destroy(ctx);
 }
 
+static dist_field in_16_bits(dist_field field)
+{
+    field.eval_fn = field.coarse_fn;
+    field.fused_fn = NULL;
+    return field;
+}
+
 /* A picture all in 16 bits: what it hits is the surface to within epsilon and the error of the values. */
 TEST(a_picture_in_16_bits_is_off_by_no_more_than_its_values)
 {
@@ -285,9 +292,7 @@ TEST(a_picture_in_16_bits_is_off_by_no_more_than_its_values)
         dist_net *net = small_net(ctx);
         dist_net_set_half(ctx, net, kinds[j]);
         dist_shape *shape = dist_shape_create(ctx, net, NULL);
-        dist_field field = dist_shape_field(shape), half = field;
-        half.eval_fn = field.coarse_fn;
-        half.fused_fn = NULL;
+        dist_field field = dist_shape_field(shape), half = in_16_bits(field);
         dist_camera camera = dist_camera_look_at(SIZE, SIZE, 0.7f, eye, at, up);
         dist_images out;
         memset(&out, 0, sizeof out);
@@ -323,11 +328,10 @@ TEST(error_bounds_of_a_picture_in_16_bits_count_in_what_its_values_are_off)
         if (!has(kinds[j])) continue;
         dist_context *ctx = test_context();
         dist_net *net = dist_net_load_file(ctx, "examples/model.safetensors");
+        REQUIRE(net != NULL);
         CHECK_STATUS(DIST_OK, dist_net_set_half(ctx, net, kinds[j]), ctx);
         dist_shape *shape = dist_shape_create(ctx, net, dist_net_code(net, 5));
-        dist_field field = dist_shape_field(shape), half = field;
-        half.eval_fn = field.coarse_fn;
-        half.fused_fn = NULL;
+        dist_field field = dist_shape_field(shape), half = in_16_bits(field);
         dist_camera camera = dist_camera_look_at(SIZE, SIZE, 0.7f, eye, at, up);
         dist_images out;
         memset(&out, 0, sizeof out);

@@ -1337,7 +1337,7 @@ TEST(steps_that_may_have_gone_through_something_are_taken_back)
     dist_context_destroy(ctx);
 }
 
-/* Against rays that step by at most f / 2.5. Without the rules above 31 holes, not 3. */
+/* Against rays that step by at most f / 2.5. */
 TEST(the_default_tracer_loses_one_hit_in_ten_thousand_of_the_embedded_family)
 {
     dist_context *ctx = shape_context();

@@ -593,8 +593,8 @@ typedef struct dist_images {
     float *error;          /* bound on the error of distance, as good as f's slopes are sampled; 0 where that is the
                               background. Behind the edge of a nearer surface it reaches to that; with
                               how.certified only where a slope beyond the Lipschitz figure was met in the same tile.
-                              With field.coarse_fn for eval_fn field.coarse_error is counted in; where a ray just
-                              meets or just passes an edge, it may be on the other side of it.
+                              With field.coarse_fn for eval_fn field.coarse_error is counted in, near outlines by
+                              what is seen beside; a ray that just meets an edge may go on far behind it.
                               DIST_TRACE_PAPER: |f| of a hit's sample, no bound */
     dist_stats *stats;
 } dist_images;
@@ -8210,6 +8210,8 @@ typedef struct disti_tracer {
     float far, ratio; /* from |f| = far on the slope is at most lipschitz / ratio */
 } disti_tracer;
 
+static int disti_is_coarse(const dist_field *field) { return field->coarse_fn && field->eval_fn == field->coarse_fn; }
+
 DIST_API dist_render_desc dist_render_desc_resolve(const dist_render_desc *desc)
 {
     dist_render_desc how;
@@ -9332,7 +9334,7 @@ static float disti_ray_bound(const disti_tracer *tracer, const disti_ray *ray)
     double distance = ray->base + (double)ray->best, coarse = 0.0;
     if (tracer->how.trace == DIST_TRACE_PAPER) return ray->error; /* |f|, no bound */
     if (ray->status != DIST_RAY_HIT && ray->status != DIST_RAY_UNRESOLVED) return ray->error;
-    if (field->coarse_fn && field->eval_fn == field->coarse_fn) {
+    if (disti_is_coarse(field)) {
         float slope = ray->slope < 0.0f ? -ray->slope : ray->slope, most = 0.5f * tracer->lipschitz;
         slope = slope > 0.0f && slope < most ? DISTI_MAX(slope, 0.06f * tracer->lipschitz) : most;
         coarse = (double)field->coarse_error / (double)slope;
@@ -10190,6 +10192,40 @@ static void disti_trace_doubt(const disti_tracer *tracer, const disti_tile *tile
             off = DISTI_MIN(off < 0.0f ? -off : off, cubic < 0.0f ? -cubic : cubic);
             doubt = DISTI_MAX(doubt, 1.5f * off);
         }
+        ray->error = DISTI_MAX(ray->error, doubt / ray->cosine);
+    }
+}
+
+enum { DISTI_ASIDE = 4 };
+
+/* The same where f is off by coarse_error, which moves the surface aside, too: by coarse_error / slope, seen as so many
+   pixels. The exact depth is then among those met within them, or, at an outline, up to as far again behind. On an even
+   surface less than a pixel moves it by as much less; the slope is taken as a quarter of that expected, as that is
+   where f is worse than its Lipschitz figure says. */
+static void disti_coarse_doubt(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench)
+{
+    int n = tile->width * tile->height;
+    float moved = tracer->field->coarse_error / (0.75f * tracer->lipschitz);
+    for (int i = 0, x = -1, y = 0; i < n; i++) {
+        if (++x == tile->width) x = 0, y++;
+        float z = bench->depth[i], near = 0.0f, far = 0.0f;
+        if (!(z > 0.0f)) continue;
+        disti_ray *ray = &bench->rays[i];
+        float pixel = 2.0f * ray->footprint * z, pixels = DISTI_MIN(moved / pixel, (float)(DISTI_ASIDE - 1));
+        int reach = 1 + (int)pixels, outline = 0;
+        for (int k = 0; k < 16; k++) { /* eight ways, next to it and as far as it reaches */
+            int way = (k & 7) < 4 ? k & 7 : (k & 7) + 1, by = k < 8 ? 1 : reach;
+            int u = x + (way % 3 - 1) * by, v = y + (way / 3 - 1) * by;
+            if (u < 0 || v < 0 || u >= tile->width || v >= tile->height) continue;
+            float other = bench->depth[v * tile->width + u];
+            outline |= !(other > 0.0f);
+            if (!(other > 0.0f)) continue;
+            near = DISTI_MAX(near, z - other);
+            far = DISTI_MAX(far, other - z);
+        }
+        float doubt = DISTI_MAX(near, far);
+        if (outline) doubt *= 1.5f;
+        else if (doubt <= 2.0f * (DISTI_MIN(near, far) + pixel)) doubt *= DISTI_MIN(1.0f, 4.0f * pixels);
         ray->error = DISTI_MAX(ray->error, doubt / ray->cosine);
     }
 }
@@ -11981,7 +12017,10 @@ static void disti_render_task(void *arg, int index, int worker)
         else disti_trace_all(tracer, worker, &bench, (size_t)n);
         int proven = tracer->how.certified && !(bench.stats->steepest > 0.0f);
         bench.stats->steepest = DISTI_MAX(bench.stats->steepest, steepest);
-        if (!proven && (job->out->error || job->out->stats)) disti_trace_doubt(tracer, &tile, &bench);
+        if (job->out->error || job->out->stats) {
+            if (!proven) disti_trace_doubt(tracer, &tile, &bench);
+            if (disti_is_coarse(tracer->field)) disti_coarse_doubt(tracer, &tile, &bench);
+        }
         budget.marching = 0;
         disti_tile_trim(job, &tile, &bench);
         disti_trace_end(tracer, &bench, (size_t)(tile.width * tile.height));

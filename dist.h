@@ -8398,7 +8398,7 @@ static int disti_ray_ask(disti_ray *ray, int mode, float q)
    that f crosses 0 earlier (disti_ray_bent), from there on. No less than what f's noise hides. */
 static float disti_ray_kink(const disti_tracer *tracer, const disti_ray *ray, float falls)
 {
-    float most = 0.02f * tracer->field->radius, flat = tracer->noise;
+    float most = 0.04f * tracer->field->radius, flat = tracer->noise;
     if (falls < 0.15f * tracer->lipschitz && ray->incline < -2.0f * falls)
         flat = 12.0f * disti_ray_epsilon(tracer, ray, ray->a);
     flat = DISTI_MAX(flat < most * falls ? flat / falls : most, ray->target);

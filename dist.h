@@ -9082,59 +9082,78 @@ static float disti_cover_end(disti_cover *cover)
 
 enum { DISTI_PARTS = 192 };
 
-/* Moves the cover's end through a pixel's balls, those of at least this reach; what they cover beyond a gap is added to
-   the `count` in parts. */
-static int disti_clear_parts(const disti_clear *pool, int i, int reach, const disti_ray *ray, disti_cover *cover,
-                             float parts[DISTI_PARTS][2], int count)
+typedef struct disti_part {
+    float from, to;
+} disti_part;
+
+/* Returns the end of the cover, moved through a pixel's balls, those of at least this reach; what they cover beyond a
+   gap is added to the *count in parts. */
+static float disti_clear_parts(const disti_clear *ball, const disti_clear *pool, int reach, const float o[3],
+                               const float v[3], float end, disti_part parts[DISTI_PARTS], int *count)
 {
-    for (; i >= 0 && pool[i].reach >= reach && count < DISTI_PARTS; i = pool[i].next) {
-        const float *c = pool[i].center;
-        float d[3] = {c[0] - ray->origin[0], c[1] - ray->origin[1], c[2] - ray->origin[2]};
-        float along = d[0] * ray->direction[0] + d[1] * ray->direction[1] + d[2] * ray->direction[2];
-        float half = pool[i].square - (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] - along * along);
-        float ahead = cover->end - along;
-        if (!(half > 0.0f) || (ahead > 0.0f && half <= ahead * ahead)) continue;
-        half = sqrtf(half);
-        if (along - half <= cover->end) {
-            cover->end = along + half;
-            continue;
+    int n = *count;
+    for (; ball->reach >= reach && n < DISTI_PARTS; ball = pool + ball->next) {
+        float d[3] = {ball->center[0] - o[0], ball->center[1] - o[1], ball->center[2] - o[2]};
+        float along = d[0] * v[0] + d[1] * v[1] + d[2] * v[2];
+        float half = ball->square - (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] - along * along);
+        float ahead = end - along;
+        if (half > 0.0f && !(ahead > 0.0f && half <= ahead * ahead)) {
+            half = sqrtf(half);
+            if (along - half <= end) {
+                end = along + half;
+            } else {
+                parts[n].from = along - half;
+                parts[n++].to = along + half;
+            }
         }
-        parts[count][0] = along - half;
-        parts[count++][1] = along + half;
+        if (ball->next < 0) break;
     }
-    return count;
+    *count = n;
+    return end;
 }
 
-/* Fills in the cover of a ray, whose end is where it sets out. */
+/* Fills in the cover of a ray, whose end is where it sets out: in order of where they begin, the parts that no gap is
+   before move it on, the others are joined where they meet. */
 static void disti_cover_begin(const disti_bench *bench, int index, const disti_ray *ray, disti_cover *cover)
 {
     const disti_balls *balls = bench->balls;
-    float parts[DISTI_PARTS][2], before;
-    int x = index % bench->width, y = index / bench->width, h = balls->stride, window = balls->window, count = 0;
-    int x0 = DISTI_MAX(x - window + h, 0) / h * h, x1 = DISTI_MIN(x + window, bench->width - 1);
-    int y0 = DISTI_MAX(y - window + h, 0) / h * h, y1 = DISTI_MIN(y + window, bench->height - 1);
-    for (int v = y0; v <= y1; v += h) {
-        for (int u = x0; u <= x1; u += h) {
-            int at = v * bench->width + u, away = (u - x) * (u - x) + (v - y) * (v - y);
-            if (balls->reach[at] > 0 && balls->reach[at] >= away)
-                count = disti_clear_parts(balls->ball, balls->head[at], away, ray, cover, parts, count);
+    const float o[3] = {ray->origin[0], ray->origin[1], ray->origin[2]};
+    const float v[3] = {ray->direction[0], ray->direction[1], ray->direction[2]};
+    disti_part parts[DISTI_PARTS];
+    float end = cover->end;
+    int width = bench->width, x = index % width, y = index / width, h = balls->stride, window = balls->window;
+    int x0 = DISTI_MAX(x - window + h, 0) / h * h, x1 = DISTI_MIN(x + window, width - 1);
+    int y0 = DISTI_MAX(y - window + h, 0) / h * h, y1 = DISTI_MIN(y + window, bench->height - 1), count = 0;
+    for (int row = y0; row <= y1; row += h) {
+        const unsigned char *reach = balls->reach + row * width;
+        for (int u = x0, most = (row - y) * (row - y); u <= x1; u += h) {
+            int away = most + (u - x) * (u - x);
+            if (reach[u] == 0 || reach[u] < away) continue;
+            end = disti_clear_parts(balls->ball + balls->head[row * width + u], balls->ball, away, o, v, end, parts,
+                                    &count);
         }
     }
-    do { /* those that no gap is before any more; what is left of them */
-        int left = 0;
-        before = cover->end;
-        for (int i = 0; i < count; i++) {
-            if (parts[i][1] <= cover->end) continue;
-            if (parts[i][0] <= cover->end) {
-                cover->end = parts[i][1];
-                continue;
-            }
-            parts[left][0] = parts[i][0];
-            parts[left++][1] = parts[i][1];
+    int left = 0, beyond = 0;
+    for (int i = 0; i < count; i++) {
+        disti_part part = parts[i];
+        if (part.to <= end) continue;
+        int k = left++;
+        for (; k > 0 && parts[k - 1].from > part.from; k--) parts[k] = parts[k - 1];
+        parts[k] = part;
+    }
+    for (int i = 0; i < left; i++) {
+        if (parts[i].from <= end) {
+            end = DISTI_MAX(end, parts[i].to);
+        } else if (beyond > 0 && parts[i].from <= cover->to[beyond - 1]) {
+            cover->to[beyond - 1] = DISTI_MAX(cover->to[beyond - 1], parts[i].to);
+        } else {
+            if (beyond == DISTI_COVERS) break;
+            cover->from[beyond] = parts[i].from;
+            cover->to[beyond++] = parts[i].to;
         }
-        count = left;
-    } while (cover->end > before);
-    for (int i = 0; i < count; i++) disti_cover_add(cover, parts[i][0], parts[i][1]);
+    }
+    cover->end = end;
+    cover->beyond = beyond;
 }
 
 /* How far along the ray the balls around it cover it without a gap, from s on. */
@@ -9145,7 +9164,6 @@ static float disti_covered(const disti_bench *bench, int index, const disti_ray 
     int looked = balls->looked[index];
     if (!looked || s < cover->begin || s > cover->end) cover->begin = cover->end = s;
     if (looked) return disti_cover_end(cover);
-    cover->beyond = 0;
     disti_cover_begin(bench, index, ray, cover);
     balls->looked[index] = 1;
     return cover->end;
@@ -11368,7 +11386,7 @@ static void disti_warm_hits(disti_warm *warm, int pass)
         if (pass == 1 && wide <= epsilon && other != 0) spread = wide;
         /* amid others at a crease; where the picture has hardly moved, those may have mended old errors of theirs */
         float unlike = DISTI_MAX(-3.0f * warm->typical / ray->slope, move < 0.0f ? -move : move);
-        float error = 8.0f * epsilon + 2.0f * spread + unlike;
+        float error = (8.0f - warm->tracer->lipschitz / ray->slope) * epsilon + 2.0f * spread + unlike;
         if (spread <= 5.0f * epsilon) disti_warm_hit(warm, i, s + move, 0.0f, error);
         else disti_warm_list(warm, i, DISTI_ASK_NEWTON, s + move);
     }

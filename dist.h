@@ -12194,7 +12194,8 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
                tracer.how.trace == DIST_TRACE_GUARDED;
     job.cheap = job.lazy && field->cost > 0.0f && field->cost < 5000.0f;
     job.tile = tracer.how.trace == DIST_TRACE_PAPER ? DISTI_TILE_USUAL / 2 : disti_tile_least(view.width, view.height);
-    if (job.tile == DISTI_TILE_USUAL && (field->many || job.cheap)) job.tile = DISTI_TILE;
+    int large = (double)view.width * (double)view.height >= 768.0 * 768.0; /* enough of them all the same */
+    if (job.tile == DISTI_TILE_USUAL && (field->many || job.cheap || large)) job.tile = DISTI_TILE;
     job.across = (view.width + job.tile - 1) / job.tile;
     int listed = disti_render_list(&tracer, &view, &job);
     job.count = listed ? listed : job.across * ((view.height + job.tile - 1) / job.tile);

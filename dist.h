@@ -3223,7 +3223,8 @@ static dist_status disti_field_check(dist_context *ctx, const dist_field *field,
         {"field.lipschitz", (double)field->lipschitz, 0, 3e38}, {"field.detail", (double)field->detail, 0, 3e38},
         {"field.lipschitz_far", (double)field->lipschitz_far, 0, 3e38}, {"field.clamp", (double)field->clamp, 0, 3e38},
         {"field.cost", (double)field->cost, 0, 3e38}, {"field.code_size", (double)field->code_size, 0, 3e38},
-        {"field.color_code_size", (double)field->color_code_size, 0, 3e38}};
+        {"field.color_code_size", (double)field->color_code_size, 0, 3e38},
+        {"field.coarse_error", (double)field->coarse_error, 0, 3e38}};
     dist_status status = disti_limits(ctx, function, sizeof limits / sizeof limits[0], limits);
     if (status != DIST_OK) return status;
     if (field->owner && field->owner != ctx) return disti_refuse(ctx, "%s: field belongs to another context", function);
@@ -10214,7 +10215,7 @@ static void disti_trace_doubt(const disti_tracer *tracer, const disti_tile *tile
     }
 }
 
-enum { DISTI_ASIDE = 4 };
+enum { DISTI_ASIDE = 3 }; /* pixels that a surface is moved by, at most */
 
 /* The same where f is off by coarse_error, which moves the surface aside, too: by coarse_error / slope, seen as so many
    pixels. The exact depth is then among those met within them, or, at an outline, up to as far again behind. On an even
@@ -10229,7 +10230,7 @@ static void disti_coarse_doubt(const disti_tracer *tracer, const disti_tile *til
         float z = bench->depth[i], near = 0.0f, far = 0.0f;
         if (!(z > 0.0f)) continue;
         disti_ray *ray = &bench->rays[i];
-        float pixel = 2.0f * ray->footprint * z, pixels = DISTI_MIN(moved / pixel, (float)(DISTI_ASIDE - 1));
+        float pixel = 2.0f * ray->footprint * z, pixels = DISTI_MIN(moved / pixel, (float)DISTI_ASIDE);
         int reach = 1 + (int)pixels, outline = 0;
         for (int k = 0; k < 16; k++) { /* eight ways, next to it and as far as it reaches */
             int way = (k & 7) < 4 ? k & 7 : (k & 7) + 1, by = k < 8 ? 1 : reach;

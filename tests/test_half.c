@@ -402,6 +402,14 @@ TEST(error_bounds_count_in_what_any_coarse_fn_is_off)
         field.coarse_fn = wavy_torus;
         field.eval_fn = wavy_torus;
         check_bounds(ctx, "torus", torus, field, 64 << j % 3);
+        const float wrong[] = {-1e30f, (float)NAN, (float)INFINITY};
+        for (int k = 0; k < 3; k++) {
+            float f, p[3] = {0.0f, 0.0f, 0.0f};
+            field.coarse_error = wrong[k];
+            CHECK_EQUAL(DIST_BAD_ARGUMENT, dist_field_eval(ctx, &field, 1, p, &f, NULL));
+            CHECK(strstr(dist_context_message(ctx), "field.coarse_error") != NULL);
+            dist_context_clear(ctx);
+        }
         dist_context_destroy(ctx);
     }
 }

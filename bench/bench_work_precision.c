@@ -23,8 +23,8 @@
    double, a network's derivatives too. norm_error: |g - exact| / |exact|. gradient_queries: those of the
    picture with a tape and the points of its adjoint; gradient_seconds: of both, one run. Warm pictures start from that
    of a code one part in 2000 away. guarded_dense leaves no dead unit out where only values are asked for. guarded_f16
-   and _bf16 take field.coarse_fn for everything (dist_net_set_half): the bound then counts in what f was seen to be off,
-   not that a ray at an edge may pass it. Where the processor has none of it the row says "not available".
+   and _bf16 take field.coarse_fn for everything (dist_net_set_half): the bound then counts in what f was seen to be off.
+   Where the processor has none of it the row says "not available".
 
    --minutes bounds what a case's size takes beside its reference: the rows come in order of importance (`plan`), which
    is the csv's. One that takes more than a 40th of the time with 7 runs is made with fewer (column `runs`; the defaults

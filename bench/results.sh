@@ -137,8 +137,9 @@ else
 fi
 assemble
 
-# Every sweep at every size as far as the minutes go, one scene on each of two cores. A plot of each scene and size is
-# in build/work_precision; some are shown.
+# Every sweep at every size as far as the minutes go, one scene on each of two cores. The defaults stay in one table, a
+# scene's sweeps get their own: in all too large for a file. A plot of each scene and size is in build/work_precision;
+# some are shown.
 sweep() {
     build/bench_work_precision --svg build/work_precision/q "$@" >build/work_precision/rows || return 1
     head -n 1 build/work_precision/rows
@@ -160,15 +161,22 @@ elif [ "$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1)" -ge 2 ]; then
     DIST_ORIGIN="$DIST_ORIGIN; another scene on the other core"
 fi
 csv work_precision sweep $how --at-once $at_once && {
+    rm -f "$folder"/work_precision_*.csv
+    awk -F , -v stem="$folder/work_precision" -v defaults="$folder/work_precision.tmp" '
+        /^#/ || /^case/ { head = head $0 "\n"; print >defaults; next }
+        $3 == "default" || $3 == "not available" { print >defaults; next }
+        { file = stem "_" $1 ".csv" }
+        file != last { if (last) close(last); printf "%s", head >file; last = file }
+        { print >file }' "$folder/work_precision.csv" && mv "$folder/work_precision.tmp" "$folder/work_precision.csv"
     for name in sizes losses $shown; do
         plot=build/work_precision/q_$name.svg
         [ ! -e "$plot" ] || cp "$plot" "$folder/work_precision_$name.svg"
     done
     echo "Defaults only, $table_size x $table_size pixels: the error of the distance, against a reference in double, that"
-    echo "99 % of the hits keep (wrong pixels of the mask; queries a pixel). The sweeps of epsilon, alpha, budget and K, every"
-    echo "other measure and the times are in the csv. n/a: this processor has no such arithmetic, or the field is no network;"
-    echo "empty: left out for its time. [work_precision.txt](work_precision.txt): where bounds are violated, where a row of"
-    echo "the paper's tracer is cheaper or more exact, what was left out."
+    echo "99 % of the hits keep (wrong pixels of the mask; queries a pixel). Every other measure and the times are in the csv,"
+    echo "a scene's sweeps of epsilon, alpha, budget and K in work_precision_SCENE.csv. n/a: this processor has no such"
+    echo "arithmetic, or the field is no network; empty: left out for its time. [work_precision.txt](work_precision.txt):"
+    echo "where bounds are violated, where a row of the paper's tracer is cheaper or more exact, what was left out."
     echo
     awk -F , -v size="$table_size" -v methods="paper_parallel_100 paper_aggressive_50 paper_coarse_to_fine_50 guarded certified guarded_f16 \
 guarded_bf16" '

@@ -28,6 +28,7 @@ columns pose degrees_start,distance_start,trial,shape,method,degrees_end,distanc
 columns needs need,size,rays,queries,backward
 columns code_size 'target,left out,bytes,saved'
 columns work_precision case,method,parameter,value,resolution,queries,queries_per_pixel
+columns work_precision_embedded_5 case,method,parameter,value,resolution,queries,queries_per_pixel
 columns pose_curve method,degrees_start,step,degrees_quarter,degrees_median
 
 for name in ladder marching threshold photos pose completion; do

@@ -8549,8 +8549,8 @@ static int disti_ray_step(const disti_tracer *tracer, disti_ray *ray)
 }
 
 /* A step that the spheres of radius f / L at its two ends do not cover is taken back, unless it is too short to
-   matter or it followed a surface at a low angle and found f about where the slope said, not almost 0 instead: that may
-   be the far side of what it went through. */
+   matter or it followed a surface at a low angle and found f about where the slope said or somewhat above, as over one
+   that bends away, not almost 0 instead: that may be the far side of what it went through. */
 static int disti_ray_trusts(const disti_tracer *tracer, const disti_ray *ray, float f, float step)
 {
     float expected = ray->f + ray->slope * step;
@@ -8559,7 +8559,7 @@ static int disti_ray_trusts(const disti_tracer *tracer, const disti_ray *ray, fl
     if (creeps && expected > 0.0f) return 1;
     float off = f - expected;
     if (f < 0.25f * expected && -off > 0.1f * ray->f) return 0;
-    return ray->mode == DISTI_JUMP && expected > 0.0f && (off < 0.0f ? -off : off) < 0.3f * ray->f;
+    return ray->mode == DISTI_JUMP && expected > 0.0f && off > -0.3f * ray->f && off < 0.5f * ray->f;
 }
 
 /* A step down from a to s that was trusted though spheres do not cover it, no mere chord, and now f rises from s: does
@@ -10024,8 +10024,8 @@ static disti_guess disti_predict_axis(const disti_tracer *tracer, const disti_ra
 }
 
 /* Sets up pixel (x, y) for its first query, half way between pixels at distance h known along x, y or both. 0: it
-   needs none: between four hits alike which were themselves predicted to within half of epsilon, or to within two where
-   those along x and along y say the same, it is interpolated. */
+   needs none: between four hits alike which were themselves predicted to within 1.25 epsilon, from twice as far, or to
+   within two where those along x and along y say the same, it is interpolated. */
 static int disti_predict(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench, int x, int y,
                           int h)
 {
@@ -10063,7 +10063,7 @@ static int disti_predict(const disti_tracer *tracer, const disti_tile *tile, con
         ray->width = DISTI_MAX(4.0f, 0.35f / (0.03f + 0.5f * guess.spread));
     ray->s = ray->start;
     if (guess.quality > 0 && disti_ray_aims(tracer, ray, ray->guard - 1e-3f * tracer->field->radius)) {
-        int alike = guess.off <= 0.5f * epsilon || (guess.off <= 2.0f * epsilon && guess.differ <= 0.5f * epsilon);
+        int alike = guess.off <= 1.25f * epsilon || (guess.off <= 2.0f * epsilon && guess.differ <= 0.5f * epsilon);
         if (h == 1 && guess.quality == 3 && guess.off > 0.0f && alike) {
             ray->slope = guess.slope;
             ray->off = guess.off;

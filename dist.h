@@ -10024,8 +10024,8 @@ static disti_guess disti_predict_axis(const disti_tracer *tracer, const disti_ra
 }
 
 /* Sets up pixel (x, y) for its first query, half way between pixels at distance h known along x, y or both. 0: it
-   needs none: between four hits alike which were themselves predicted to within 1.25 epsilon, from twice as far, or to
-   within two where those along x and along y say the same, it is interpolated. */
+   needs none: between four hits alike which were themselves predicted to within half of epsilon, or to within two where
+   those along x and along y say the same, it is interpolated. */
 static int disti_predict(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench, int x, int y,
                           int h)
 {
@@ -10063,7 +10063,7 @@ static int disti_predict(const disti_tracer *tracer, const disti_tile *tile, con
         ray->width = DISTI_MAX(4.0f, 0.35f / (0.03f + 0.5f * guess.spread));
     ray->s = ray->start;
     if (guess.quality > 0 && disti_ray_aims(tracer, ray, ray->guard - 1e-3f * tracer->field->radius)) {
-        int alike = guess.off <= 1.25f * epsilon || (guess.off <= 2.0f * epsilon && guess.differ <= 0.5f * epsilon);
+        int alike = guess.off <= 0.5f * epsilon || (guess.off <= 2.0f * epsilon && guess.differ <= 0.5f * epsilon);
         if (h == 1 && guess.quality == 3 && guess.off > 0.0f && alike) {
             ray->slope = guess.slope;
             ray->off = guess.off;

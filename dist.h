@@ -8722,14 +8722,14 @@ static int disti_ray_aim(disti_ray *ray)
     return disti_ray_ask(ray, DISTI_PREDICT, ray->target);
 }
 
-/* How far a step of Newton's from f along a slope may end from the surface. Short of it nothing tells whether f bends
-   on the way, most likely where it is flat already; a slope that is not the ray's own says little over the lengths of a
-   coarse epsilon: 2, 5, 20 and .75 of epsilon are chosen by what decoders do, not derived. */
-static float disti_newton_error(const disti_tracer *tracer, float epsilon, float f, float slope, float length,
-                                int own)
+/* How far a step of Newton's of this length along a slope may end from the surface. Nothing tells whether f bends on
+   the way, out of the solid or into it, most likely where it is flat already; a slope that is not the ray's own says
+   little over the lengths of a coarse epsilon: 2, 5, 20 and .75 of epsilon are chosen by what decoders do, not
+   derived. */
+static float disti_newton_error(const disti_tracer *tracer, float epsilon, float slope, float length, int own)
 {
     int coarse = disti_coarse(tracer, epsilon);
-    float error = (f > 0.0f && slope > -0.6f * tracer->lipschitz ? 20.0f : coarse ? 5.0f : 2.0f) * length;
+    float error = (slope > -0.6f * tracer->lipschitz ? 20.0f : coarse ? 5.0f : 2.0f) * length;
     if (coarse && !own) error = DISTI_MAX(error, 0.75f * epsilon);
     return error - tracer->noise / slope;
 }
@@ -8753,7 +8753,7 @@ static int disti_ray_predicted(const disti_tracer *tracer, disti_ray *ray, float
         ray->slope = slope;
         if (length > 0.125f * (float)(ray->base + (double)ray->q) * ray->footprint) ray->own = 0; /* of a pixel: 1/16 */
         ray->off = DISTI_MAX(off < 0.0f ? -off : off, 1e-9f);
-        float error = disti_newton_error(tracer, epsilon, f, slope, length, ray->own);
+        float error = disti_newton_error(tracer, epsilon, slope, length, ray->own);
         return disti_ray_end(ray, DIST_RAY_HIT, ray->q + step, f, error);
     }
     if (!good || ray->q + step <= (fronted ? ray->s : ray->start) || ray->q + step >= ray->leave) {
@@ -10174,7 +10174,8 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
    reaches to there. A predicted hit may be off by half as much again as it differs from the cubic through its
    neighbors, (-1, 4, 4, -1) / 6, or from their mean if that is less: where the surface is smooth, next to nothing. At
    a small step it lies between them. Where f hardly falls at the hit it may have been flat before, and have crossed 0
-   within the band's few epsilon: the bound reaches as far as that takes at this slope. */
+   within the band's few epsilon, the default's where a finer one is asked for, as the field is no flatter for that: the
+   bound reaches as far as that takes at this slope. */
 static void disti_trace_doubt(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench)
 {
     int n = tile->width * tile->height;
@@ -10187,7 +10188,7 @@ static void disti_trace_doubt(const disti_tracer *tracer, const disti_tile *tile
         disti_ray *ray = &bench->rays[i];
         float falls = ray->slope < 0.0f ? -ray->slope : ray->slope;
         if (falls < 0.06f * tracer->lipschitz && ray->sign > 0.0f) {
-            float flat = 6.0f * disti_ray_epsilon(tracer, ray, ray->best);
+            float flat = 8.0f * DISTI_MAX(disti_ray_epsilon(tracer, ray, ray->best), 5e-5f * tracer->detail);
             ray->error = DISTI_MAX(ray->error, flat < most * falls ? flat / falls : most);
         }
         for (int axis = 0; axis < 2; axis++) {
@@ -11281,7 +11282,7 @@ static int disti_warm_newton(disti_warm *warm, int i, float f)
     ray->q += step;
     steep = slope < -0.3f * warm->tracer->lipschitz;
     if (good && length <= (!first ? 12.0f : steep ? 8.0f : 4.0f) * epsilon) {
-        disti_warm_hit(warm, i, ray->q, f, disti_newton_error(warm->tracer, epsilon, f, slope, length, 0));
+        disti_warm_hit(warm, i, ray->q, f, disti_newton_error(warm->tracer, epsilon, slope, length, 0));
         disti_warm_change(warm, moved * slope);
         return 0;
     }

@@ -197,7 +197,7 @@ guarded_bf16" '
                   print line } }' "$folder/work_precision.csv"
     echo
     echo "The default as pictures grow, in the same way, with the median of the seconds. Of pictures larger than 256 x 256"
-    echo "(chairs_3, spot_512 and spot_512_he: than 128 x 128) as many pixels, spread evenly, are compared, and counted."
+    echo "(mug: 512 x 512; chairs_3, spot_512, spot_512_he: 128 x 128) as many pixels, spread evenly, are compared, and counted."
     echo
     awk -F , '
         /^#/ || /^case/ { next }

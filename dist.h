@@ -8340,12 +8340,17 @@ static void disti_ray_init(const dist_field *field, const double center[3], cons
                     center[2] - (double)field->center[2], direction[0], direction[1], direction[2], footprint, ray);
 }
 
+static float disti_default_epsilon(const disti_tracer *tracer)
+{
+    return 5e-5f * tracer->detail;
+}
+
 /* |f| that counts as the surface at s: epsilon, but no more than half a pixel there, and no less than float's noise. */
 static float disti_ray_epsilon(const disti_tracer *tracer, const disti_ray *ray, float s)
 {
     if (tracer->epsilon > 0.0f) return tracer->epsilon;
     float pixel = (float)(ray->base + (double)s) * ray->footprint;
-    float epsilon = 5e-5f * tracer->detail;
+    float epsilon = disti_default_epsilon(tracer);
     epsilon = ray->footprint > 0.0f && pixel < epsilon ? pixel : epsilon;
     return DISTI_MAX(epsilon, tracer->noise);
 }
@@ -8598,7 +8603,7 @@ static int disti_ray_least(const disti_tracer *tracer, disti_ray *ray)
     float epsilon = disti_ray_near(tracer, ray, ray->s);
     int flat = DISTI_MAX(ray->fa, ray->fb) - ray->f < tracer->noise;
     float gentler = DISTI_MIN(left, right);
-    float thin = DISTI_MIN(epsilon, DISTI_MAX(5e-5f * tracer->detail, tracer->noise));
+    float thin = DISTI_MIN(epsilon, DISTI_MAX(disti_default_epsilon(tracer), tracer->noise));
     int narrow = gentler > 0.3f * tracer->lipschitz || (gentler > 0.0f && !flat && ray->b - ray->a < thin);
     int sheet = narrow && ray->f < 0.5f * thin; /* too thin to be sure of */
     if (spent || drop < ray->f) {
@@ -9340,7 +9345,7 @@ static void disti_stats_end(dist_context *ctx, const disti_tracer *tracer, dist_
         if (s->error > out->error) out->error = s->error; /* not -0 over 0, which would tell the workers' order */
         if (s->epsilon > 0.0f) out->epsilon = DISTI_MIN(out->epsilon, s->epsilon);
     }
-    if (out->epsilon > 1e38f) out->epsilon = tracer->epsilon > 0.0f ? tracer->epsilon : 5e-5f * tracer->detail;
+    if (out->epsilon > 1e38f) out->epsilon = tracer->epsilon > 0.0f ? tracer->epsilon : disti_default_epsilon(tracer);
     out->lipschitz = tracer->lipschitz;
 }
 
@@ -9822,7 +9827,7 @@ static int disti_cone_advance(const disti_tracer *tracer, disti_cone *cone, floa
         cone->least_f = f;
         cone->least_t = cone->t;
     }
-    float margin = tracer->epsilon > 0.0f ? tracer->epsilon : 5e-5f * tracer->detail;
+    float margin = tracer->epsilon > 0.0f ? tracer->epsilon : disti_default_epsilon(tracer);
     double radius = (double)disti_empty(tracer, f - margin);
     double wide = cone->t * cone->sine;
     if (radius < 1.05 * cone->t * cone->chord || radius <= wide) return DISTI_CONE_BLOCKED;
@@ -10174,7 +10179,7 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
    reaches to there. A predicted hit may be off by half as much again as it differs from the cubic through its
    neighbors, (-1, 4, 4, -1) / 6, or from their mean if that is less: where the surface is smooth, next to nothing. At
    a small step it lies between them. Where f hardly falls at the hit it may have been flat before, and have crossed 0
-   within the band's few epsilon, the default's where a finer one is asked for, as the field is no flatter for that: the
+   within the band's few epsilon, the default's where a finer one is asked for, as the field is no steeper for that: the
    bound reaches as far as that takes at this slope. */
 static void disti_trace_doubt(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench)
 {
@@ -10188,7 +10193,7 @@ static void disti_trace_doubt(const disti_tracer *tracer, const disti_tile *tile
         disti_ray *ray = &bench->rays[i];
         float falls = ray->slope < 0.0f ? -ray->slope : ray->slope;
         if (falls < 0.06f * tracer->lipschitz && ray->sign > 0.0f) {
-            float flat = 8.0f * DISTI_MAX(disti_ray_epsilon(tracer, ray, ray->best), 5e-5f * tracer->detail);
+            float flat = 8.0f * DISTI_MAX(disti_ray_epsilon(tracer, ray, ray->best), disti_default_epsilon(tracer));
             ray->error = DISTI_MAX(ray->error, flat < most * falls ? flat / falls : most);
         }
         for (int axis = 0; axis < 2; axis++) {

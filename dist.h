@@ -8361,10 +8361,12 @@ static int disti_coarse(const disti_tracer *tracer, float epsilon)
     return epsilon > 4e-4f * tracer->detail;
 }
 
-/* |f| from which on the ray feels its way: a coarse epsilon says how exact a hit is to be, not what may be passed. */
+/* |f| from which on the ray feels its way: a coarse epsilon says how exact a hit is to be, not what may be passed. A
+   certified ray marches on until little more than noise is left: its steps are proven, and longer than feeling. */
 static float disti_ray_near(const disti_tracer *tracer, const disti_ray *ray, float s)
 {
-    return DISTI_MIN(disti_ray_epsilon(tracer, ray, s), DISTI_MAX(5e-4f * tracer->detail, tracer->noise));
+    float most = tracer->how.certified ? 1e-6f : 5e-4f;
+    return DISTI_MIN(disti_ray_epsilon(tracer, ray, s), DISTI_MAX(most * tracer->detail, tracer->noise));
 }
 
 static int disti_ray_end(disti_ray *ray, int status, float s, float f, float error)
@@ -8401,13 +8403,15 @@ static int disti_ray_ask(disti_ray *ray, int mode, float q)
 /* How far before a hit the surface may be for a ray that came down steeply, but crosses 0 slowly, by `falls`: between
    the two f bends, and where it is as flat as that, ripples of the surface's |f| may have crossed 0 before. Over a
    bracket that is flat from the start they may have done so anywhere in it, and where what was sampled before it says
-   that f crosses 0 earlier (disti_ray_bent), from there on. No less than what f's noise hides. */
+   that f crosses 0 earlier (disti_ray_bent), from there on. No less than what f's noise hides, at a slope that is known
+   no better than as a 16th of the Lipschitz figure where the bracket's ends differ by no more than noise. */
 static float disti_ray_kink(const disti_tracer *tracer, const disti_ray *ray, float falls)
 {
     float most = 0.04f * tracer->field->radius, flat = tracer->noise;
     if (falls < 0.15f * tracer->lipschitz && ray->incline < -2.0f * falls)
         flat = 12.0f * disti_ray_epsilon(tracer, ray, ray->a);
     flat = DISTI_MAX(flat < most * falls ? flat / falls : most, ray->target);
+    if (ray->fa - ray->fb < 2.0f * tracer->noise) flat = DISTI_MAX(flat, 16.0f * tracer->noise / tracer->lipschitz);
     return ray->incline > -0.12f * tracer->lipschitz ? DISTI_MAX(flat, DISTI_MIN(ray->width, most)) : flat;
 }
 
@@ -8472,12 +8476,22 @@ static int disti_ray_bracketed(const disti_tracer *tracer, disti_ray *ray, float
     return disti_ray_bracket(tracer, ray);
 }
 
+/* Whether no surface but the one that f crosses between a and b, fa > 0 >= fb, fits in there: how much of it is beyond
+   the spheres of radius |f| / L at its ends is no more than `most` of the radius, nothing if certified. */
+static int disti_ray_alone(const disti_tracer *tracer, float a, float fa, float b, float fb, float most)
+{
+    float room = tracer->how.certified ? 4.8e-7f : most;
+    return b - a - (fa - fb) / tracer->lipschitz <= room * tracer->field->radius;
+}
+
 /* How far before the end of a bracket [a, b] f may have crossed 0: the slope before it foretells a crossing at
    a + fa / -slope, and where f falls by less than 0.6 of that slope (chosen, not derived) it has bent on the way, above
-   0 or below. Certified steps allow no crossing before a. */
+   0 or below. Certified steps allow no crossing before a, and none in a bracket but where the budget was spent or the
+   Lipschitz figure wrong. */
 static float disti_ray_bent(const disti_tracer *tracer, const disti_ray *ray, float a, float fa, float b, float fb)
 {
-    if (tracer->how.certified || !ray->known || -0.6f * ray->slope * (b - a) <= fa - fb) return 0.0f;
+    if (tracer->how.certified) return disti_ray_alone(tracer, a, fa, b, fb, 0.0f) ? 0.0f : b - a;
+    if (!ray->known || -0.6f * ray->slope * (b - a) <= fa - fb) return 0.0f;
     return b - a + fa / ray->slope;
 }
 
@@ -8514,9 +8528,9 @@ static float disti_ray_floor(const disti_tracer *tracer, const disti_ray *ray)
 }
 
 /* Where to look next from the front: near the surface a jump to where the last slope says that f ends, at most three
-   spheres or a hundredth of the radius far; else a sphere step, stretched by what the slope allows: for a
-   plane that recedes or comes at the angle seen, 2 / (1 - slope) (auto-relaxation). What is found there is checked on
-   arrival. */
+   spheres or a hundredth of the radius far, but nothing proves it; else a sphere step, stretched by what the slope
+   allows: for a plane that recedes or comes at the angle seen, 2 / (1 - slope) (auto-relaxation), somewhat less as the
+   slope changes. What is found there is checked on arrival. */
 static int disti_ray_step(const disti_tracer *tracer, disti_ray *ray)
 {
     float radius = disti_empty(tracer, ray->f);
@@ -8526,10 +8540,11 @@ static int disti_ray_step(const disti_tracer *tracer, disti_ray *ray)
         return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->b, ray->fb);
     if (ray->s + radius >= ray->leave)
         return disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest * ray->sign, 0.0f);
-    float stretch = !ray->known ? tracer->how.step_scale : DISTI_MAX(1.0f, 1.8f / (1.0f - DISTI_MIN(slope, 0.75f)));
+    float relaxed = (tracer->how.certified ? 1.95f : 1.8f) / (1.0f - DISTI_MIN(slope, 0.75f));
+    float stretch = !ray->known ? tracer->how.step_scale : DISTI_MAX(1.0f, relaxed);
     float step = radius * DISTI_MIN(stretch, 8.0f);
     int mode = DISTI_MARCH;
-    if (ray->known && slope < -0.05f && ray->f < 0.05f * tracer->field->radius) {
+    if (ray->known && slope < -0.05f && ray->f < 0.05f * tracer->field->radius && !tracer->how.certified) {
         float jump = ray->f / -ray->slope, cap = 3.0f * radius + epsilon;
         step = 1.03f * jump + 0.5f * epsilon;
         if (step > cap) { /* short of the end: f must still be positive there, or something came in between */
@@ -8826,7 +8841,8 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
     case DISTI_JUMP: {
         float radius = disti_empty(tracer, ray->f), step = q - ray->s;
         float spacing = 4.8e-7f * tracer->field->radius;
-        if (ray->fb < 0.0f && f > 0.0f && q < ray->b && ++ray->side >= 3 && !tracer->how.certified)
+        if (ray->fb < 0.0f && f > 0.0f && q < ray->b && ++ray->side >= 3 && !tracer->how.certified &&
+            (ray->side >= 8 || disti_ray_alone(tracer, q, f, ray->b, ray->fb, 5e-3f)))
             return disti_ray_open_bracket(tracer, ray, q, f, ray->b, ray->fb);
         float gap = step - radius - disti_empty(tracer, f < 0.0f ? -f : f); /* what neither sphere covers */
         int back = ray->mode != DISTI_SKIP && step > 1.0001f * radius + spacing;
@@ -8857,9 +8873,8 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
             return disti_ray_ask(ray, DISTI_MARCH, DISTI_MIN(ray->s + DISTI_MAX(radius, spacing), ray->leave));
         }
         if (ray->fb < 0.0f) { /* a crossing lies before b: is there room for another before it? */
-            float left = ray->b - q - (f - ray->fb) / tracer->lipschitz;
             if (ray->b <= q) return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->b, ray->fb);
-            if (left <= (tracer->how.certified ? spacing : 1e-3f * tracer->field->radius))
+            if (disti_ray_alone(tracer, q, f, ray->b, ray->fb, 1e-3f))
                 return disti_ray_open_bracket(tracer, ray, q, f, ray->b, ray->fb);
         }
         ray->a = ray->s;
@@ -8883,8 +8898,10 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
     }
     }
     if (ray->f < disti_ray_near(tracer, ray, ray->s)) {
-        if (ray->fb < 0.0f && ray->b > ray->s)
+        if (ray->fb < 0.0f && ray->b > ray->s) { /* what is near need not be what is at b */
+            if (!disti_ray_alone(tracer, ray->s, ray->f, ray->b, ray->fb, 5e-3f)) return disti_ray_step(tracer, ray);
             return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->b, ray->fb);
+        }
         float epsilon = disti_ray_near(tracer, ray, ray->s);
         ray->side = 0;
         ray->moved = ray->slope < 0.0f; /* came down to here from farther out: from a, or where f was epsilon */
@@ -11393,7 +11410,8 @@ static void disti_warm_hits(disti_warm *warm, int pass)
         if (pass == 1 && wide <= epsilon && other != 0) spread = wide;
         /* amid others at a crease; where the picture has hardly moved, those may have mended old errors of theirs */
         float unlike = DISTI_MAX(-3.0f * warm->typical / ray->slope, move < 0.0f ? -move : move);
-        float error = (8.0f - warm->tracer->lipschitz / ray->slope) * epsilon + 2.0f * spread + unlike;
+        float within = ray->slope > -0.45f * warm->tracer->lipschitz ? 32.0f : 8.0f; /* what is flat may move alone */
+        float error = (within - warm->tracer->lipschitz / ray->slope) * epsilon + 2.0f * spread + unlike;
         if (spread <= 5.0f * epsilon) disti_warm_hit(warm, i, s + move, 0.0f, error);
         else disti_warm_list(warm, i, DISTI_ASK_NEWTON, s + move);
     }

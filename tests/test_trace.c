@@ -343,6 +343,137 @@ TEST(no_sheet_before_a_solid_is_passed)
     dist_context_destroy(ctx);
 }
 
+/* Up to six boxes, plates, rods and balls together, turned any way: rounded boxes. */
+typedef struct test_parts {
+    int count;
+    double center[6][3], axes[6][3][3], half[6][3], radius[6];
+} test_parts;
+
+static double parts_value(const test_parts *parts, const double p[3])
+{
+    double least = 1e30;
+    for (int k = 0; k < parts->count; k++) {
+        double out = 0, in = -1e30;
+        for (int i = 0; i < 3; i++) {
+            double q = 0;
+            for (int j = 0; j < 3; j++) q += parts->axes[k][i][j] * (p[j] - parts->center[k][j]);
+            q = fabs(q) - parts->half[k][i];
+            out += q > 0 ? q * q : 0;
+            in = fmax(in, q);
+        }
+        least = fmin(least, sqrt(out) + fmin(in, 0) - parts->radius[k]);
+    }
+    return least;
+}
+
+static void parts_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    (void)worker;
+    for (size_t i = 0; i < n; i++) {
+        double p[3], ends[2];
+        for (int k = 0; k < 3; k++) p[k] = (double)points[3 * i + (size_t)k];
+        sdf[i] = (float)parts_value((const test_parts *)user, p);
+        for (int k = 0; k < 3 && gradient; k++) {
+            for (int e = 0; e < 2; e++) {
+                double at[3] = {p[0], p[1], p[2]};
+                at[k] += e ? 1e-5 : -1e-5;
+                ends[e] = parts_value((const test_parts *)user, at);
+            }
+            gradient[3 * i + (size_t)k] = (float)((ends[1] - ends[0]) / 2e-5);
+        }
+    }
+}
+
+static test_parts parts_make(test_random *r, float thin)
+{
+    test_parts parts;
+    parts.count = 1 + (int)test_random_float(r, 0, 5.99f);
+    for (int k = 0; k < parts.count; k++) {
+        float x[3], y[3], size = test_random_float(r, 0.05f, 0.3f);
+        int kind = (int)test_random_float(r, 0, 3.99f); /* how many sides are as thin as the rounding */
+        test_random_direction(r, x);
+        test_random_direction(r, y);
+        double dot = 0, length = 0;
+        for (int i = 0; i < 3; i++) dot += (double)x[i] * (double)y[i];
+        for (int i = 0; i < 3; i++) {
+            parts.axes[k][0][i] = (double)x[i];
+            parts.axes[k][1][i] = (double)y[i] - dot * (double)x[i];
+            length += parts.axes[k][1][i] * parts.axes[k][1][i];
+            parts.center[k][i] = (double)test_random_float(r, -0.4f, 0.4f);
+            parts.half[k][i] = i < kind ? 0 : (double)test_random_float(r, 0.05f, 0.3f);
+        }
+        for (int i = 0; i < 3; i++) parts.axes[k][1][i] /= sqrt(length);
+        for (int i = 0; i < 3; i++) {
+            int j = (i + 1) % 3, l = (i + 2) % 3;
+            parts.axes[k][2][i] = parts.axes[k][0][j] * parts.axes[k][1][l] - parts.axes[k][0][l] * parts.axes[k][1][j];
+        }
+        parts.radius[k] = kind == 3 ? (double)size : (double)(thin * test_random_float(r, 1, 4));
+    }
+    return parts;
+}
+
+/* Where a ray first meets the parts, marched in double; 0: nowhere, -1: it goes in by less than 1e-4 of the radius. */
+static double parts_meet(const test_parts *parts, const float o[3], const float d[3])
+{
+    double p[3], f = 1, t = 0.4;
+    for (; t < 3.2 && f > 1e-6; t += f) {
+        for (int i = 0; i < 3; i++) p[i] = (double)o[i] + t * (double)d[i];
+        f = parts_value(parts, p);
+    }
+    if (f > 1e-6) return 0;
+    for (double s = t; s < t + 2e-3; s += 2e-5) {
+        for (int i = 0; i < 3; i++) p[i] = (double)o[i] + s * (double)d[i];
+        if (parts_value(parts, p) < -1e-4) return t;
+    }
+    return -1;
+}
+
+/* Thin parts before, behind and beside others. The default tracer takes steps on trust; certified ones are proven. */
+TEST(one_hit_in_a_thousand_is_lost_of_random_thin_parts_and_none_certified)
+{
+    dist_context *ctx = shape_context();
+    int scenes = test_quick() ? 12 : 60, crossing = 0, lost[2] = {0, 0}, broken[2] = {0, 0};
+    for (int k = 0; k < scenes; k++) {
+        test_random r = test_random_seed(100 + (unsigned)k);
+        test_parts parts = parts_make(&r, 5e-4f);
+        float eye[3];
+        const float middle[3] = {0, 0, 0}, up[3] = {0, 1, 0};
+        test_random_direction(&r, eye);
+        for (int i = 0; i < 3; i++) eye[i] *= 2;
+        dist_camera camera = dist_camera_look_at(64, 64, 0.7f, eye, middle, up);
+        dist_field field;
+        memset(&field, 0, sizeof field);
+        field.user = &parts;
+        field.eval_fn = parts_eval;
+        field.radius = field.lipschitz = 1;
+        dist_render_desc how = plain_how();
+        CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, &how, &picture_a), ctx);
+        how.certified = 1;
+        CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, &how, &picture_b), ctx);
+        for (int i = 0; i < 64 * 64; i++) {
+            float o[3], d[3];
+            dist_camera_ray(&camera, (float)(i % 64), (float)(i / 64), o, d);
+            double t = parts_meet(&parts, o, d);
+            crossing += t > 0;
+            for (int c = 0; c < 2 && t > 0; c++) {
+                const picture *p = c ? &picture_b : &picture_a;
+                double off = (double)p->distance[i] - t;
+                lost[c] += !p->mask[i] || off > 2e-3;
+                broken[c] += p->mask[i] && fabs(off) > (double)p->error[i] + 1e-4;
+            }
+        }
+    }
+    if (test_state.verbose)
+        printf("    %d crossing; lost %d, certified %d; beyond their bound %d, %d\n", crossing, lost[0], lost[1],
+               broken[0], broken[1]);
+    CHECK(crossing > 300 * scenes);
+    CHECK(lost[0] * 1000 <= crossing);
+    CHECK(broken[0] * 1000 <= crossing);
+    CHECK_EQUAL(0, lost[1]);
+    CHECK_EQUAL(0, broken[1]);
+    dist_context_destroy(ctx);
+}
+
 /* The far figure bounds slopes where f is large: a looser one costs queries and loses nothing; bad ones are refused. */
 TEST(lipschitz_far_holds_where_f_is_large)
 {
@@ -1607,6 +1738,7 @@ int main(int argc, char **argv)
     RUN(no_rod_thinner_than_a_pixel_is_missed);
     RUN(certified_rays_miss_nothing);
     RUN(no_sheet_before_a_solid_is_passed);
+    RUN(one_hit_in_a_thousand_is_lost_of_random_thin_parts_and_none_certified);
     RUN(lipschitz_far_holds_where_f_is_large);
     RUN(cones_change_no_pixel);
     RUN(grazing_rays_hit_within_the_bound_or_say_that_they_are_unresolved);

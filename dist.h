@@ -8477,11 +8477,11 @@ static int disti_ray_bracketed(const disti_tracer *tracer, disti_ray *ray, float
 }
 
 /* Whether no surface but the one that f crosses between a and b, fa > 0 >= fb, fits in there: how much of it is beyond
-   the spheres of radius |f| / L at its ends is no more than `most` of the radius, nothing if certified. */
+   the empty spheres at its ends is no more than `most` of the radius, nothing if certified. */
 static int disti_ray_alone(const disti_tracer *tracer, float a, float fa, float b, float fb, float most)
 {
     float room = tracer->how.certified ? 4.8e-7f : most;
-    return b - a - (fa - fb) / tracer->lipschitz <= room * tracer->field->radius;
+    return b - a - disti_empty(tracer, fa) - disti_empty(tracer, -fb) <= room * tracer->field->radius;
 }
 
 /* How far before the end of a bracket [a, b] f may have crossed 0: the slope before it foretells a crossing at

@@ -8528,9 +8528,10 @@ static float disti_ray_floor(const disti_tracer *tracer, const disti_ray *ray)
 }
 
 /* Where to look next from the front: near the surface a jump to where the last slope says that f ends, at most three
-   spheres or a hundredth of the radius far, but nothing proves it; else a sphere step, stretched by what the slope
-   allows: for a plane that recedes or comes at the angle seen, 2 / (1 - slope) (auto-relaxation), somewhat less as the
-   slope changes. What is found there is checked on arrival. */
+   spheres or a hundredth of the radius far, but nothing proves it: not if certified, and not before a sample that lies
+   in a solid, where what is proven counts; else a sphere step, stretched by what the slope allows: for a plane that
+   recedes or comes at the angle seen, 2 / (1 - slope) (auto-relaxation), somewhat less as the slope changes. What is
+   found there is checked on arrival. */
 static int disti_ray_step(const disti_tracer *tracer, disti_ray *ray)
 {
     float radius = disti_empty(tracer, ray->f);
@@ -8544,7 +8545,8 @@ static int disti_ray_step(const disti_tracer *tracer, disti_ray *ray)
     float stretch = !ray->known ? tracer->how.step_scale : DISTI_MAX(1.0f, relaxed);
     float step = radius * DISTI_MIN(stretch, 8.0f);
     int mode = DISTI_MARCH;
-    if (ray->known && slope < -0.05f && ray->f < 0.05f * tracer->field->radius && !tracer->how.certified) {
+    int leaps = ray->known && !tracer->how.certified && !(ray->fb < 0.0f);
+    if (leaps && slope < -0.05f && ray->f < 0.05f * tracer->field->radius) {
         float jump = ray->f / -ray->slope, cap = 3.0f * radius + epsilon;
         step = 1.03f * jump + 0.5f * epsilon;
         if (step > cap) { /* short of the end: f must still be positive there, or something came in between */
@@ -8842,7 +8844,7 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
         float radius = disti_empty(tracer, ray->f), step = q - ray->s;
         float spacing = 4.8e-7f * tracer->field->radius;
         if (ray->fb < 0.0f && f > 0.0f && q < ray->b && ++ray->side >= 3 && !tracer->how.certified &&
-            (ray->side >= 8 || disti_ray_alone(tracer, q, f, ray->b, ray->fb, 5e-3f)))
+            (ray->side >= 8 || disti_ray_alone(tracer, q, f, ray->b, ray->fb, 2e-3f)))
             return disti_ray_open_bracket(tracer, ray, q, f, ray->b, ray->fb);
         float gap = step - radius - disti_empty(tracer, f < 0.0f ? -f : f); /* what neither sphere covers */
         int back = ray->mode != DISTI_SKIP && step > 1.0001f * radius + spacing;
@@ -8899,7 +8901,7 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
     }
     if (ray->f < disti_ray_near(tracer, ray, ray->s)) {
         if (ray->fb < 0.0f && ray->b > ray->s) { /* what is near need not be what is at b */
-            if (!disti_ray_alone(tracer, ray->s, ray->f, ray->b, ray->fb, 5e-3f)) return disti_ray_step(tracer, ray);
+            if (!disti_ray_alone(tracer, ray->s, ray->f, ray->b, ray->fb, 2e-3f)) return disti_ray_step(tracer, ray);
             return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->b, ray->fb);
         }
         float epsilon = disti_ray_near(tracer, ray, ray->s);

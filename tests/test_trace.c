@@ -1251,7 +1251,8 @@ static int bound_side(void)
 
 /* picture_a is traced and compared with picture_b, the truth: of the hits that are also the truth's, 999 of 1000 at
    least must be off by no more than their error and the truth's together. Hits where the truth has none are false, and
-   at most 1 in 1000, like those of which the truth is not known. With a `how` of its own: 2 in 1000. */
+   at most 1 in 1000, like those of which the truth is not known. With a `how` of its own: 2 in 1000. Of fewer than 1000
+   hits one may be beyond. */
 static void bound_check(dist_context *ctx, const char *name, const dist_field *field, const dist_camera *camera,
                         const dist_render_desc *how)
 {
@@ -1273,7 +1274,8 @@ static void bound_check(dist_context *ctx, const char *name, const dist_field *f
         worst = fmax(worst, over);
     }
     double share = how && how->epsilon < 1e-3f ? 0.9987 : 0.999; /* the mug has 4 of 3500 at thin creases just met */
-    int good = CHECK(both > 0) & CHECK(held >= share * both) & CHECK(phantom * 1000 <= (how ? 2 : 1) * hits) &
+    int good = CHECK(both > 0) & CHECK(held >= share * both || both - held == 1) &
+               CHECK(phantom * 1000 <= (how ? 2 : 1) * hits) &
                CHECK(unknown <= 2 + hits / 1000); /* flat at float noise */
     if (!good || test_state.verbose)
         printf("    %s: hits %d, within the bound %.3f %%, beyond it by %.1e at most, false %d, truth unknown %d\n",

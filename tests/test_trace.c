@@ -1426,7 +1426,11 @@ TEST(bounds_reach_to_where_f_was_foretold_to_cross_and_over_what_is_flat)
     CHECK(disti_ray_open_bracket(&tracer, &ray, 0, 5.211e-3f, 5.2115e-3f, -5e-7f)); /* but this is */
     CHECK_EQUAL(0, disti_ray_bracketed(&tracer, &ray, 5.211e-3f - ray.q));
     CHECK(ray.error < 1e-5f);
-    tracer.how.certified = 0;
+    CHECK(disti_ray_alone(&tracer, 0, 0.1f, 0.5f, -0.5f, 0));
+    tracer.far = 0.1f; /* twice as steep where |f| is larger: 0.5 is at least 0.3 deep, not 0.5 */
+    tracer.ratio = 0.5f;
+    CHECK(!disti_ray_alone(&tracer, 0, 0.1f, 0.5f, -0.5f, 0));
+    CHECK_STATUS(DIST_OK, disti_tracer_init(&tracer, ctx, &field, NULL, "test"), ctx);
     memset(&ray, 0, sizeof ray);
     ray.sign = 1;
     ray.base = 2;

@@ -18,6 +18,9 @@
    Queries, operations and seconds are those of a picture of distance and mask alone; seconds: median of `runs`. With
    the silhouette they are queries_with_silhouette and, of one run, seconds_with_silhouette.
 
+   Methods that differ in their gradient alone (guarded_K*, guarded_uncapped, paper_K*) have the picture of guarded or of
+   paper_coarse_to_fine_50, measured once: only their gradient's columns are their own.
+
    Gradients are those of sum of |n . v| depth over the pixels that should be hit, for the code and for the camera
    (rotation and translation), against the exact ones: the implicit function theorem at the reference's points, all in
    double, a network's derivatives too. norm_error: |g - exact| / |exact|. gradient_queries: those of the
@@ -26,9 +29,9 @@
    and _bf16 take field.coarse_fn for everything (dist_net_set_half): the bound then counts in what f was seen to be off.
    Where the processor has none of it the row says "not available".
 
-   --minutes bounds what a case's size takes beside its reference: the rows come in order of importance (`plan`), which
-   is the csv's. One that takes more than a 40th of the time with 7 runs is made with fewer (column `runs`; the defaults
-   of the first four methods: more than an 8th). One that takes more than an 8th with a single run (of a slow decoder: a
+   --minutes bounds what a case's size takes beside its reference; what one does not need goes to the sizes and cases
+   after it. The rows come in order of importance (`plan`), which is the csv's. One that takes more than a 40th of the
+   time with 7 runs is made with fewer (column `runs`; the defaults of the first four methods: more than an 8th). One that takes more than an 8th with a single run (of a slow decoder: a
    third), or more than is left, is left out, with a word on stderr; never the defaults of guarded, certified and the
    paper's two fastest rows (of slow decoders beyond 256 x 256: of guarded). "done" on stderr tells what a size took.
 
@@ -55,7 +58,7 @@ static const char usage[] =
     "  --size N           only pictures of N x N (default 64, 128, 256, 512 and 1024)\n"
     "  --largest N        pictures of 64 x 64 up to N x N (default 1024)\n"
     "  --long             slow decoders (8 x 512 and with layer norm) are compared at as many pixels as others\n"
-    "  --minutes M        for each case and size, beside its reference (default: no bound)\n"
+    "  --minutes M        for each case and size on average, beside its reference (default: no bound)\n"
     "  --svg STEM         also plots, STEM_CASE_N.svg\n"
     "  --workers N        threads of a picture (default 1: then seconds vary least)\n"
     "  --at-once N        cases at a time, each on a core of its own, cheap ones beside slow ones; the rows of one\n"
@@ -996,11 +999,12 @@ typedef struct sweep {
     reference ref;
     half halves[2]; /* F16, BF16 */
     int quick, all_slow;     /* slow scenes compared at as many pixels as others */
-    double most, end;        /* seconds for a case's size, 0: no bound; when they are over */
+    double most, end;        /* seconds for this size, 0: no bound; when they are over */
+    double left;             /* of the case's seconds */
     double seconds[METHODS]; /* of a default picture, here or, times four, of half the size; 0: not known */
     const char *svg;         /* stem of the plots' names; NULL: none */
     row *rows;
-    size_t count;
+    size_t count, count_left_out;
     char left_out[256]; /* what was last left out, and of which parameter's values */
 } sweep;
 
@@ -1011,9 +1015,18 @@ typedef struct part {
 } part;
 
 static const part plan[] = {
-    {"default", 0, NEVER_LEFT_OUT}, {"epsilon", 0, 1}, {"epsilon", 2, 3}, {"default", NEVER_LEFT_OUT, 12},
-    {"epsilon", 1, 2},              {"epsilon", 3, 4}, {"alpha", 0, 4},   {"steps", 0, 4},
-    {"default", 12, METHODS},       {"epsilon", 4, METHODS},
+    {"default", 0, NEVER_LEFT_OUT},
+    {"epsilon", 0, 1},
+    {"epsilon", 2, 3},
+    {"default", NEVER_LEFT_OUT, 15},
+    {"epsilon", 1, 2},
+    {"epsilon", 3, 4},
+    {"epsilon", 11, 15}, /* as the pictures of the first row */
+    {"alpha", 0, 4},
+    {"steps", 0, 4},
+    {"default", 15, METHODS},
+    {"epsilon", 4, 11},
+    {"epsilon", 15, METHODS},
 };
 enum { PARTS = sizeof plan / sizeof plan[0] };
 
@@ -1054,6 +1067,20 @@ static dist_render_desc how_of(const method *m, const char *parameter, double va
     return how;
 }
 
+/* The row that has the picture of m, which differs from its method in the gradient alone; NULL: none. */
+static const row *picture_of(const sweep *w, const method *m, const char *parameter, double value)
+{
+    if (!m->gradient && !m->uncapped) { return NULL; }
+    for (size_t i = w->count; i-- > 0;) {
+        const row *r = &w->rows[i];
+        if (r->m == &methods[m->trace == DIST_TRACE_PAPER ? 2 : 0] && r->size == w->camera.width &&
+            strcmp(r->parameter, parameter) == 0 && r->value == value) {
+            return r;
+        }
+    }
+    return NULL;
+}
+
 /* Says what is left out, the values of one parameter on one line: value NULL ends it. */
 static void leave_out(sweep *w, const method *m, const char *parameter, const double *value)
 {
@@ -1092,11 +1119,16 @@ static void add_row(sweep *w, const method *m, const char *parameter, double val
     dist_render_desc how = how_of(m, parameter, value);
     row r;
     memset(&r, 0, sizeof r);
-    if (most > 0 && *expected * (1 + OTHERS) <= most) {
+    const row *known = picture_of(w, m, parameter, value);
+    if (known && known->gradient_seconds <= most) {
+        r = *known;
+        gradient(&j, &how, &r);
+    } else if (most > 0 && *expected * (1 + OTHERS) <= most) {
         r = picture(&j, &how, m->dense, w->quick ? 3 : RUNS, limit, most);
     }
     if (by_default && r.seconds > 0) { *expected = r.seconds; }
     if (!r.runs) {
+        w->count_left_out++;
         leave_out(w, m, parameter, &value);
         return;
     }
@@ -1133,7 +1165,7 @@ static void sweep_values(sweep *w, const part *of)
 }
 
 /* One field at one size. */
-static void sweep_field(sweep *w, int size)
+static void sweep_field(sweep *w, int size, int sizes_left)
 {
     size_t first = w->count;
     double start = seconds_now();
@@ -1147,9 +1179,11 @@ static void sweep_field(sweep *w, int size)
     j->weights = take_floats(w->ref.n);
     exact_gradient(j);
     double begin = seconds_now();
+    w->most = w->left / sizes_left;
     w->end = begin + w->most;
     for (int k = 0; k < PARTS; k++) { sweep_values(w, &plan[k]); }
     leave_out(w, NULL, "", NULL);
+    if (w->left > 0) { w->left = fmax(w->left - (seconds_now() - begin), 1e-3); } /* 0 would be no bound */
     for (size_t k = 0; k < METHODS; k++) { w->seconds[k] *= 4; }
     reference_destroy(&w->ref);
     free(j->exact);
@@ -1157,6 +1191,13 @@ static void sweep_field(sweep *w, int size)
     if (w->svg && w->count > first) { plot_rows(w->svg, w->rows + first, w->count - first); }
     fprintf(stderr, "done %s %d: %d rows in %.1f s, and %.1f s for the reference\n", j->s->name, size,
             (int)(w->count - first), seconds_now() - begin, begin - start);
+}
+
+static int sizes_between(int size, int last)
+{
+    int n = 0;
+    for (; size <= last; size *= 2) { n++; }
+    return n;
 }
 
 /* w: a scene's own, with its rows. */
@@ -1191,8 +1232,9 @@ static void run_scene(sweep *w, const scene *s, int workers, int only_size, int 
     w->subject.shape = shape;
     w->subject.e = net ? &e : NULL;
     w->subject.code_size = net ? (size_t)dist_net_code_size(net) : 0;
-    for (int size = only_size ? only_size : 64; size <= (only_size ? only_size : largest); size *= 2) {
-        sweep_field(w, size);
+    int last = only_size ? only_size : largest;
+    for (int size = only_size ? only_size : 64; size <= last; size *= 2) {
+        sweep_field(w, size, sizes_between(size, last));
     }
     for (int k = 0; k < 2; k++) {
         dist_shape_destroy(w->halves[k].shape);
@@ -1344,16 +1386,23 @@ static void plot_sizes(const char *stem, const row *rows, size_t n)
 typedef struct queue {
     int waiting[SCENES];
     int first, end;
+    double seconds; /* left for those that wait; 0: no bound */
 } queue;
 
-/* The next case, or -1: every second thread takes them from the end, so that slow ones have cheap ones beside them. */
-static int next_case(queue *q, int thread)
+/* The next case, or -1: every second thread takes them from the end, so that slow ones have cheap ones beside them.
+   seconds: in, what the thread's last case did not need; out, the next one's. */
+static int next_case(queue *q, int thread, double *seconds)
 {
     int i = -1;
 #ifdef _OPENMP
 #pragma omp critical
 #endif
-    if (q->first < q->end) { i = thread % 2 ? q->waiting[--q->end] : q->waiting[q->first++]; }
+    if (q->first < q->end) {
+        q->seconds += *seconds;
+        *seconds = q->seconds / (q->end - q->first);
+        q->seconds -= *seconds;
+        i = thread % 2 ? q->waiting[--q->end] : q->waiting[q->first++];
+    }
     return i;
 }
 
@@ -1361,6 +1410,7 @@ int main(int argc, char **argv)
 {
     const char *only = NULL;
     int only_size = 0, largest = 0, workers = 1, at_once = 1, list = 0;
+    double minutes = 0;
     sweep common;
     queue cases;
     memset(&common, 0, sizeof common);
@@ -1378,7 +1428,7 @@ int main(int argc, char **argv)
         } else if (option_is(&o, "--long")) {
             common.all_slow = option_flag(&o);
         } else if (option_is(&o, "--minutes")) {
-            common.most = 60 * option_number(&o, 1e-3, 1e6);
+            minutes = option_number(&o, 1e-3, 1e6);
         } else if (option_is(&o, "--svg")) {
             common.svg = option_text(&o);
         } else if (option_is(&o, "--workers")) {
@@ -1399,11 +1449,12 @@ int main(int argc, char **argv)
     }
     if (list) { return 0; }
     if (cases.end == 0) { fail("no case is called %s: --list names them", only); }
+    cases.seconds = 60 * minutes * cases.end * (only_size ? 1 : sizes_between(64, largest));
 #ifndef _OPENMP
     if (at_once > 1) { fputs("one case at a time: compiled without OpenMP\n", stderr); }
 #endif
     row *rows = (row *)take((size_t)SCENES * MOST_ROWS, sizeof *rows);
-    size_t counts[SCENES] = {0}, n = 0;
+    size_t counts[SCENES] = {0}, n = 0, left_out = 0;
     puts("case,method,parameter,value,resolution,queries,queries_per_pixel,operations_per_pixel,seconds,mean_error,"
          "p99_error,max_error,holes,false_hits,normal_p99_degrees,silhouette_mean_error,bound_violations_per_mille,"
          "runs,seconds_min,seconds_max,hits,unresolved,touched_per_mille,queries_with_silhouette,"
@@ -1418,11 +1469,18 @@ int main(int argc, char **argv)
 #ifdef _OPENMP
         me = omp_get_thread_num();
 #endif
-        for (int i = next_case(&cases, me); i >= 0; i = next_case(&cases, me)) {
+        double seconds = 0;
+        for (int i = next_case(&cases, me, &seconds); i >= 0; i = next_case(&cases, me, &seconds)) {
             sweep w = common;
             w.rows = rows + (size_t)i * MOST_ROWS;
+            w.left = seconds;
             run_scene(&w, &scenes[i], workers, only_size, largest);
+            seconds = w.left;
             counts[i] = w.count;
+#ifdef _OPENMP
+#pragma omp atomic
+#endif
+            left_out += w.count_left_out;
         }
     }
     for (size_t i = 0; i < SCENES; i++) { /* together */
@@ -1430,6 +1488,7 @@ int main(int argc, char **argv)
         n += counts[i];
     }
     print_worst(rows, n);
+    fprintf(stderr, "in all: %d rows, %d left out for their time\n", (int)n, (int)left_out);
     if (common.svg) {
         plot_sizes(common.svg, rows, n);
         plot_losses(common.svg, rows, n);

@@ -66,7 +66,7 @@ csv() {
     {
         "$@" 2>&1 >>"build/$name.csv" || echo "ended with an error: $name"
     } | while IFS= read -r line; do
-        case $line in "done "* | "skip "* | *"not installed"*) echo "    $line" >&3 ;; esac
+        case $line in "done "* | "in all: "* | "skip "* | *"not installed"*) echo "    $line" >&3 ;; esac
         printf '%s\n' "$line"
     done 3>&1 >"build/$name.txt"
     ! grep -q -x "ended with an error: $name" "build/$name.txt"
@@ -151,7 +151,7 @@ mkdir -p build/work_precision || exit 1
 table_size=128
 at_once=1
 shown="torus_grazing_128 rods_1e-3_128 embedded_5_128 mug_128 fox_512"
-how="--minutes 0.65"
+how="--minutes 1.2"
 if [ -n "$quick" ]; then
     table_size=64
     shown="embedded_5_64"
@@ -175,8 +175,9 @@ csv work_precision sweep $how --at-once $at_once && {
     echo "Defaults only, $table_size x $table_size pixels: the error of the distance, against a reference in double, that"
     echo "99 % of the hits keep (wrong pixels of the mask; queries a pixel). Every other measure and the times are in the csv,"
     echo "a scene's sweeps of epsilon, alpha, budget and K in work_precision_SCENE.csv. n/a: this processor has no such"
-    echo "arithmetic, or the field is no network; empty: left out for its time. [work_precision.txt](work_precision.txt):"
-    echo "where bounds are violated, where a row of the paper's tracer is cheaper or more exact, what was left out."
+    echo "arithmetic, or the field is no network; empty: left out for its time ($(sed -n 's/^in all: //p' "$folder/work_precision.txt"))."
+    echo "[work_precision.txt](work_precision.txt): where bounds are violated, where a row of the paper's tracer is cheaper"
+    echo "or more exact, what was left out."
     echo
     awk -F , -v size="$table_size" -v methods="paper_parallel_100 paper_aggressive_50 paper_coarse_to_fine_50 guarded certified guarded_f16 \
 guarded_bf16" '

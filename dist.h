@@ -2665,6 +2665,10 @@ typedef struct disti_half {
 } disti_half;
 
 #define DISTI_CELL(c) ((c) / DISTI_BLOCK)
+#define DISTI_BAD(v) _mm512_fpclass_ps_mask(v, 0x99) /* NaN, infinity */
+#define DISTI_LAST(from, v)                                                                                            \
+    _mm512_storeu_ps(g->last[DISTI_CELL((from) % DISTI_COLUMNS)] +                                                     \
+                         (at + (from) / DISTI_COLUMNS) * DISTI_BLOCK + (from) % DISTI_COLUMNS % DISTI_BLOCK, v)
 #define DISTI_FLUSH(i, V) DISTI_X##V(DISTI_FLUSH1, i)
 #define DISTI_HALF_TILE(name, V)                                                                                       \
     DISTI_NOINLINE DISTI_FUNCTION void disti_half_##name(disti_half *g, int o)                                         \
@@ -2672,22 +2676,14 @@ typedef struct disti_half {
         float sums[8 * DISTI_COLUMNS];                                                                                 \
         const size_t n = DISTI_WIDEN * V * 16, at = (size_t)(unsigned)o;                                               \
         const int *alive = g->alive, *const alive_end = alive ? alive + g->alive_count : NULL;                         \
-        const float *factors = g->point_weights + at / 8 * g->panel;                                                   \
+        const float *const factors = g->point_weights + at / 8 * g->panel, *const bias = g->bias + at;                 \
         const float *const weights = g->weights + at * (size_t)(unsigned)g->steps;                                     \
-        for (size_t i = 0; i < 8; i++) {                                                                               \
-            for (size_t c = 0; c < n; c += 16) {                                                                       \
-                const float *p = g->points[DISTI_CELL(c)] + c % DISTI_BLOCK;                                           \
-                __m512 sum = _mm512_set1_ps(g->bias[at + i]);                                                          \
-                for (size_t j = 0; j < (size_t)(unsigned)g->point; j++)                                                \
-                    sum = _mm512_fmadd_ps(_mm512_set1_ps(factors[j * 8 + i]), _mm512_loadu_ps(p + j * DISTI_BLOCK),    \
-                                          sum);                                                                        \
-                _mm512_storeu_ps(sums + i * DISTI_COLUMNS + c, sum);                                                   \
-            }                                                                                                          \
-        }                                                                                                              \
-        for (int to = 0; to < g->steps;) {                                                                             \
+        DISTI_SUMS_BEGIN                                                                                               \
+        int to = 0;                                                                                                    \
+        do {                                                                                                           \
             const float *w = weights + (size_t)(unsigned)to * 8, *x = g->x + (size_t)(unsigned)to * DISTI_BLOCK;       \
             to = DISTI_MIN(to + DISTI_SHORT, g->steps);                                                                \
-            DISTI_Y8(DISTI_ZERO, V)                                                                                    \
+            DISTI_STEPS_BEGIN(V)                                                                                       \
             if (alive) {                                                                                               \
                 for (; alive < alive_end && *alive < to; alive++) {                                                    \
                     const size_t k = (size_t)(unsigned)*alive;                                                         \
@@ -2703,33 +2699,38 @@ typedef struct disti_half {
                 }                                                                                                      \
                 for (; w < end; w += 8, x += DISTI_BLOCK) DISTI_STEP(8, V, DISTI_SIDE, w, x)                           \
             }                                                                                                          \
+            DISTI_FINISH(V)                                                                                            \
             DISTI_Y8(DISTI_FLUSH, V)                                                                                   \
+        } while (to < g->steps);                                                                                       \
+        for (size_t i = 0; i < 8 && g->activate; i++) {                                                                \
+            for (size_t c = 0; c < n; c += 16) g->bad |= DISTI_BAD(_mm512_loadu_ps(sums + i * DISTI_COLUMNS + c));     \
+            g->activate(g->activation, g->scale, n, sums + i * DISTI_COLUMNS, NULL);                                   \
         }                                                                                                              \
+        const __m512 least = _mm512_set1_ps(g->activate ? -3.4e38f : 0.0f);                                            \
         __mmask16 bad = 0;                                                                                             \
-        for (size_t i = 0; i < 8; i++) {                                                                               \
-            for (size_t c = 0; c < n; c += 16) {                                                                       \
-                float *sum = sums + i * DISTI_COLUMNS + c;                                                             \
-                const __m512 v = _mm512_loadu_ps(sum);                                                                 \
-                bad = (__mmask16)(bad | _mm512_fpclass_ps_mask(v, 0x99)); /* NaN, infinity */                          \
-                if (!g->activate) _mm512_storeu_ps(sum, DISTI_RELU(v));                                                \
-            }                                                                                                          \
-            if (g->activate) g->activate(g->activation, g->scale, n, sums + i * DISTI_COLUMNS, NULL);                  \
-            for (size_t c = 0; c < n && g->last[0]; c += 16)                                                           \
-                _mm512_storeu_ps(g->last[DISTI_CELL(c)] + (at + i) * DISTI_BLOCK + c % DISTI_BLOCK,                    \
-                                 _mm512_loadu_ps(sums + i * DISTI_COLUMNS + c));                                       \
-        }                                                                                                              \
-        g->bad |= bad;                                                                                                 \
-        for (size_t i = 0; i < 8 && !g->last[0]; i += DISTI_ROWS) {                                                    \
+        for (size_t i = 0; i < 8; i += DISTI_ROWS) {                                                                   \
             float *y = g->y + (at + i) / DISTI_ROWS * DISTI_BLOCK;                                                     \
             __m512i any = _mm512_setzero_si512();                                                                      \
             for (size_t j = 0; j < V; j++) {                                                                           \
-                const __m512i v = DISTI_NARROW(sums + i * DISTI_COLUMNS + j * (DISTI_COLUMNS / 3));                    \
+                const size_t from = i * DISTI_COLUMNS + j * (DISTI_COLUMNS / 3);                                       \
+                __m512 low = _mm512_loadu_ps(sums + from), high = _mm512_loadu_ps(sums + from + DISTI_SECOND);         \
+                bad = (__mmask16)(bad | DISTI_BAD(low) | DISTI_BAD(high));                                             \
+                low = _mm512_maskz_max_ps(0xffff, low, least);                                                         \
+                high = _mm512_maskz_max_ps(0xffff, high, least);                                                       \
+                if (g->last[0]) {                                                                                      \
+                    DISTI_LAST(from, low);                                                                             \
+                    DISTI_LAST(from + DISTI_SECOND, high);                                                             \
+                    continue;                                                                                          \
+                }                                                                                                      \
+                const __m512i v = DISTI_NARROW(low, high);                                                             \
                 any = _mm512_or_si512(any, v);                                                                         \
                 _mm512_storeu_si512((void *)(y + j * 16), v);                                                          \
             }                                                                                                          \
+            if (g->last[0]) continue;                                                                                  \
             g->y_alive[g->y_alive_count] = (int)((at + i) / DISTI_ROWS);                                               \
             g->y_alive_count += (int)(at + i) < g->out && _mm512_test_epi32_mask(any, any) != 0;                       \
         }                                                                                                              \
+        g->bad |= bad;                                                                                                 \
     }
 #define DISTI_HALF_KERNEL(kind)                                                                                        \
     DISTI_HALF_TILE(wide_##kind, 3)                                                                                    \
@@ -2746,7 +2747,9 @@ typedef struct disti_half {
     }
 
 /* Words besides those above: DISTI_COLUMNS points in a row's three vectors, DISTI_WIDEN f32 vectors for one of them,
-   DISTI_ROWS rows in a step, DISTI_SHORT steps between flushes, DISTI_NARROW(p) a vector of 16-bit values. */
+   DISTI_ROWS rows in a step, DISTI_SHORT steps between flushes, DISTI_SECOND from the first to the second f32 vector of
+   one of 16 bits, DISTI_NARROW(low, high) the latter; DISTI_SUMS_BEGIN and DISTI_STEPS_BEGIN: where a tile begins with
+   bias and point. */
 #undef DISTI_FUNCTION
 #undef DISTI_FMA
 #define DISTI_FUNCTION DISTI_TARGET("avx512f,avx512bw,avx512dq,avx512vl,fma,avx512fp16") DISTI_KERNEL static
@@ -2757,7 +2760,20 @@ typedef struct disti_half {
 #define DISTI_ROWS 1
 #define DISTI_SHORT 128
 #define DISTI_FLUSH1(i, j) disti_flush_f16(sums + i * DISTI_COLUMNS + j * 32, a##i##j);
-#define DISTI_NARROW(p) disti_narrow_f16(p)
+#define DISTI_SECOND 16
+#define DISTI_NARROW(low, high) disti_narrow_f16(low, high)
+#define DISTI_SUMS_BEGIN                                                                                               \
+    for (size_t i = 0; i < 8; i++) {                                                                                   \
+        for (size_t c = 0; c < n; c += 16) {                                                                           \
+            const float *p = g->points[DISTI_CELL(c)] + c % DISTI_BLOCK;                                               \
+            __m512 sum = _mm512_set1_ps(bias[i]);                                                                      \
+            for (size_t j = 0; j < (size_t)(unsigned)g->point; j++)                                                    \
+                sum = _mm512_fmadd_ps(_mm512_set1_ps(factors[j * 8 + i]), _mm512_loadu_ps(p + j * DISTI_BLOCK), sum);  \
+            _mm512_storeu_ps(sums + i * DISTI_COLUMNS + c, sum);                                                       \
+        }                                                                                                              \
+    }
+#define DISTI_STEPS_BEGIN(V) DISTI_Y8(DISTI_ZERO, V)
+#define DISTI_FINISH(V)
 DISTI_FUNCTION void disti_flush_f16(float *sum, __m512 v)
 {
     const __m512 both = _mm512_maskz_shuffle_f32x4(0xffff, v, v, 0xee); /* the upper half, twice */
@@ -2766,11 +2782,11 @@ DISTI_FUNCTION void disti_flush_f16(float *sum, __m512 v)
     _mm512_storeu_ps(sum, _mm512_add_ps(_mm512_loadu_ps(sum), low));
     _mm512_storeu_ps(sum + 16, _mm512_add_ps(_mm512_loadu_ps(sum + 16), high));
 }
-DISTI_FUNCTION __m512i disti_narrow_f16(const float *p)
+DISTI_FUNCTION __m512i disti_narrow_f16(__m512 low, __m512 high)
 {
-    const __m256i low = _mm512_maskz_cvtps_ph(0xffff, _mm512_loadu_ps(p), _MM_FROUND_TO_NEAREST_INT);
-    const __m256i high = _mm512_maskz_cvtps_ph(0xffff, _mm512_loadu_ps(p + 16), _MM_FROUND_TO_NEAREST_INT);
-    return _mm512_maskz_inserti64x4(0xff, _mm512_castsi256_si512(low), high, 1);
+    const __m256i first = _mm512_maskz_cvtps_ph(0xffff, low, _MM_FROUND_TO_NEAREST_INT);
+    const __m256i second = _mm512_maskz_cvtps_ph(0xffff, high, _MM_FROUND_TO_NEAREST_INT);
+    return _mm512_maskz_inserti64x4(0xff, _mm512_castsi256_si512(first), second, 1);
 }
 DISTI_HALF_KERNEL(f16)
 
@@ -2782,29 +2798,61 @@ DISTI_HALF_KERNEL(f16)
 #undef DISTI_SHORT
 #undef DISTI_FLUSH1
 #undef DISTI_NARROW
+#undef DISTI_SECOND
+#undef DISTI_SUMS_BEGIN
+#undef DISTI_STEPS_BEGIN
+#undef DISTI_FINISH
 #define DISTI_FUNCTION DISTI_TARGET("avx512f,avx512bw,avx512dq,avx512vl,fma,avx512bf16") DISTI_KERNEL static
 #define DISTI_FMA(c, a, b) __asm__("vdpbf16ps %1, %2, %0" : "+v"(c) : "v"(b), "v"(a))
 #define DISTI_COLUMNS DISTI_BLOCK
 #define DISTI_WIDEN 1
 #define DISTI_ROWS 2
 #define DISTI_SHORT (1 << 30)
-#define DISTI_FLUSH1(i, j) disti_flush_bf16(sums + i * DISTI_COLUMNS + j * 16, a##i##j);
-#define DISTI_NARROW(p) disti_narrow_bf16(p)
-DISTI_FUNCTION void disti_flush_bf16(float *sum, __m512 v)
-{
-    _mm512_storeu_ps(sum, _mm512_add_ps(_mm512_loadu_ps(sum), v));
-}
+#define DISTI_SECOND DISTI_COLUMNS
+#define DISTI_NARROW(low, high) disti_narrow_bf16(low, high)
+#define DISTI_FLUSH1(i, j) _mm512_storeu_ps(sums + i * DISTI_COLUMNS + j * 16, a##i##j);
+#define DISTI_SUMS_BEGIN
+#define DISTI_BIAS1(i, j) __m512 a##i##j = b##i;
+#define DISTI_BIAS(i, V) const __m512 b##i = _mm512_set1_ps(bias[i]); DISTI_X##V(DISTI_BIAS1, i)
+#define DISTI_MAC32(i, j) __asm__("vfmadd231ps %1, %2, %0" : "+v"(a##i##j) : "v"(x##j), "v"(b));
+#define DISTI_SIDE32(i, V) { const __m512 b = _mm512_set1_ps(ws[i]); DISTI_X##V(DISTI_MAC32, i) }
+/* All steps are one run, whose sums begin in registers. */
+#define DISTI_STEPS_BEGIN(V)                                                                                           \
+    DISTI_Y8(DISTI_BIAS, V)                                                                                            \
+    for (int j = 0; j < g->point; j++) DISTI_STEP(8, V, DISTI_SIDE32, factors + j * 8, g->points[0] + j * DISTI_BLOCK)
 /* Two rows, rounded to the nearest even, the first one in the low halves. */
-DISTI_FUNCTION __m512i disti_narrow_bf16(const float *p)
+DISTI_FUNCTION __m512i disti_narrow_bf16(__m512 low, __m512 high)
 {
-    const __m512i one = _mm512_set1_epi32(1), below = _mm512_set1_epi32(0x7fff);
-    __m512i low = _mm512_loadu_si512((const void *)p), high = _mm512_loadu_si512((const void *)(p + DISTI_COLUMNS));
-    const __m512i odd_low = _mm512_and_si512(_mm512_maskz_srli_epi32(0xffff, low, 16), one);
-    const __m512i odd_high = _mm512_and_si512(_mm512_maskz_srli_epi32(0xffff, high, 16), one);
-    low = _mm512_add_epi32(low, _mm512_add_epi32(below, odd_low));
-    high = _mm512_add_epi32(high, _mm512_add_epi32(below, odd_high));
-    return _mm512_mask_blend_epi16(0xaaaaaaaau, _mm512_maskz_srli_epi32(0xffff, low, 16), high);
+    const __m512i pairs = _mm512_setr_epi32(0x100000, 0x110001, 0x120002, 0x130003, 0x140004, 0x150005, 0x160006,
+                                            0x170007, 0x180008, 0x190009, 0x1a000a, 0x1b000b, 0x1c000c, 0x1d000d,
+                                            0x1e000e, 0x1f000f);
+    __m512i both;
+    __asm__("vcvtne2ps2bf16 %1, %2, %0" : "=v"(both) : "v"(low), "v"(high));
+    return _mm512_maskz_permutexvar_epi16(0xffffffffu, pairs, both);
 }
+/* With ReLU the run ends in registers, too. A sum that is not finite shows in that of all; if only the latter is not,
+   the block is evaluated in f32 without need. */
+#define DISTI_PAIR1(i, k, j)                                                                                           \
+    const __m512i v##i##j = disti_narrow_bf16(DISTI_RELU(a##i##j), DISTI_RELU(a##k##j));                               \
+    _mm512_storeu_si512((void *)(y + i / 2 * DISTI_BLOCK + j * 16), v##i##j);                                          \
+    any##i = _mm512_or_si512(any##i, v##i##j);                                                                         \
+    all = _mm512_add_ps(all, _mm512_add_ps(a##i##j, a##k##j));
+#define DISTI_PAIR(i, k, V)                                                                                            \
+    __m512i any##i = _mm512_setzero_si512();                                                                           \
+    DISTI_PAIRS##V(i, k)                                                                                               \
+    g->y_alive[g->y_alive_count] = (int)((at + i) / 2);                                                                \
+    g->y_alive_count += (int)(at + i) < g->out && _mm512_test_epi32_mask(any##i, any##i) != 0;
+#define DISTI_PAIRS1(i, k) DISTI_PAIR1(i, k, 0)
+#define DISTI_PAIRS2(i, k) DISTI_PAIR1(i, k, 0) DISTI_PAIR1(i, k, 1)
+#define DISTI_PAIRS3(i, k) DISTI_PAIR1(i, k, 0) DISTI_PAIR1(i, k, 1) DISTI_PAIR1(i, k, 2)
+#define DISTI_FINISH(V)                                                                                                \
+    if (!g->activate && !g->last[0]) {                                                                                 \
+        float *y = g->y + at / 2 * DISTI_BLOCK;                                                                        \
+        __m512 all = _mm512_setzero_ps();                                                                              \
+        DISTI_PAIR(0, 1, V) DISTI_PAIR(2, 3, V) DISTI_PAIR(4, 5, V) DISTI_PAIR(6, 7, V)                                \
+        g->bad |= DISTI_BAD(all);                                                                                      \
+        return;                                                                                                        \
+    }
 DISTI_HALF_KERNEL(bf16)
 #undef DISTI_COLUMNS
 #undef DISTI_WIDEN
@@ -2812,7 +2860,22 @@ DISTI_HALF_KERNEL(bf16)
 #undef DISTI_SHORT
 #undef DISTI_FLUSH1
 #undef DISTI_NARROW
+#undef DISTI_SECOND
+#undef DISTI_SUMS_BEGIN
+#undef DISTI_STEPS_BEGIN
+#undef DISTI_FINISH
+#undef DISTI_BIAS1
+#undef DISTI_BIAS
+#undef DISTI_MAC32
+#undef DISTI_SIDE32
+#undef DISTI_PAIR
+#undef DISTI_PAIR1
+#undef DISTI_PAIRS1
+#undef DISTI_PAIRS2
+#undef DISTI_PAIRS3
 #undef DISTI_CELL
+#undef DISTI_BAD
+#undef DISTI_LAST
 #undef DISTI_FLUSH
 #undef DISTI_HALF_TILE
 #undef DISTI_HALF_KERNEL

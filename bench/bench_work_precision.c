@@ -31,9 +31,10 @@
 
    --minutes bounds what a case's size takes beside its reference; what one does not need goes to the sizes and cases
    after it. The rows come in order of importance (`plan`), which is the csv's. One that takes more than a 40th of the
-   time with 7 runs is made with fewer (column `runs`; the defaults of the first four methods: more than an 8th). One that takes more than an 8th with a single run (of a slow decoder: a
-   third), or more than is left, is left out, with a word on stderr; never the defaults of guarded, certified and the
-   paper's two fastest rows (of slow decoders beyond 256 x 256: of guarded). "done" on stderr tells what a size took.
+   time with 7 runs is made with fewer (column `runs`; the defaults of the first four methods: more than an 8th). One
+   that takes more than an 8th with a single run (of a slow decoder: a third), or more than is left, is left out, with
+   a word on stderr; never the defaults of guarded, certified and the paper's two fastest rows (of slow decoders
+   beyond 256 x 256: of guarded). "done" on stderr tells what a size took.
 
    --svg draws each case and size. Lines join the epsilons of one method, or its alphas or budgets of steps; the larger
    markers are the defaults. A marker is open where the picture failed: more than 1 in 1000 pixels that should be hit is

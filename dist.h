@@ -552,8 +552,8 @@ typedef struct dist_hit {
 
 /* Traces n rays (origins (n, 3), directions (n, 3) of any nonzero length) with the guarded tracer: picking, shadows,
    visibility. The first surface in front of each origin; with how.any_hit any of them. A ray that is 0 or not finite
-   is DIST_RAY_NOT_FINITE. No cone and no neighbor helps a free ray to see what is thin: with
-   how.certified it asks more, and steps over nothing as far as the Lipschitz figures are bounds. */
+   is DIST_RAY_NOT_FINITE. No cone and no neighbor helps a free ray to see what is thin: with how.certified it asks
+   more, and steps over nothing as far as the Lipschitz figures are bounds. */
 DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size_t n, const float *origins,
                                 const float *directions, const dist_render_desc *how, dist_hit *hits,
                                 dist_stats *stats);

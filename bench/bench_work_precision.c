@@ -114,6 +114,7 @@ typedef struct method {
 } method;
 
 /* The last are the dearest. */
+enum { GUARDED = 0, COARSE_TO_FINE = 2 }; /* whose pictures others share */
 static const method methods[] = {
     {"guarded", DIST_TRACE_GUARDED, 0, 0, 0, 0, 0, 1, 1, 0, 0, 0, 0, 0, 0},
     {"certified", DIST_TRACE_GUARDED, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0},
@@ -1074,7 +1075,7 @@ static const row *picture_of(const sweep *w, const method *m, const char *parame
     if (!m->gradient && !m->uncapped) { return NULL; }
     for (size_t i = w->count; i-- > 0;) {
         const row *r = &w->rows[i];
-        if (r->m == &methods[m->trace == DIST_TRACE_PAPER ? 2 : 0] && r->size == w->camera.width &&
+        if (r->m == &methods[m->trace == DIST_TRACE_PAPER ? COARSE_TO_FINE : GUARDED] && r->size == w->camera.width &&
             strcmp(r->parameter, parameter) == 0 && r->value == value) {
             return r;
         }
@@ -1121,9 +1122,11 @@ static void add_row(sweep *w, const method *m, const char *parameter, double val
     row r;
     memset(&r, 0, sizeof r);
     const row *known = picture_of(w, m, parameter, value);
-    if (known && known->gradient_seconds <= most) {
-        r = *known;
-        gradient(&j, &how, &r);
+    if (known) {
+        if (known->gradient_seconds <= most) {
+            r = *known;
+            gradient(&j, &how, &r);
+        }
     } else if (most > 0 && *expected * (1 + OTHERS) <= most) {
         r = picture(&j, &how, m->dense, w->quick ? 3 : RUNS, limit, most);
     }

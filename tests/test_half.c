@@ -202,12 +202,11 @@ TEST(blocks_of_bf16_with_a_sum_that_is_not_finite_are_evaluated_in_f32)
     stretch(ctx, net, 1e36f);
     CHECK_STATUS(DIST_OK, dist_net_set_half(ctx, net, DIST_HALF_BF16), ctx);
     dist_shape *shape = dist_shape_create(ctx, net, NULL);
-    dist_field field = dist_shape_field(shape);
     test_random random = test_random_seed(6);
     for (int far = 0; far < 2; far++) {
         test_random_fill(&random, 3 * POINTS, points, -0.6f, 0.6f);
         for (int i = 0; i < POINTS && far; i += DISTI_BLOCK) points[3 * i] = 1e6f;
-        field = dist_shape_field(shape);
+        dist_field field = dist_shape_field(shape);
         dist_field_eval(ctx, &field, POINTS, points, sdf, NULL);
         field.eval_fn = field.coarse_fn;
         dist_field_eval(ctx, &field, POINTS, points, half, NULL);

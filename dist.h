@@ -1641,26 +1641,43 @@ typedef struct disti_gemm_weights {
     int out, rows, columns;
 } disti_gemm_weights;
 
-/* Sums over the rows listed, for every output o: sum[0..3][o] = sum_i weights(o, list[i]) model[i][0..3] and
-   sum[4][o] = sum_i |weights(o, list[i])| model[i][4]; sum is (5, stride), stride at least out rounded up to 8. */
+enum { DISTI_CELL_POINTS = 12, DISTI_CELLS = DISTI_BLOCK / DISTI_CELL_POINTS }; /* neighbors, and their boxes */
+
+/* Of each block, sums over the rows listed, for every output o: sum[0..3][o] = sum_i weights(o, list[i]) model[i][0..3]
+   and sum[4][o] = sum_i |weights(o, list[i])| model[i][4]; stride is at least out rounded up to 8. */
 typedef struct disti_bound {
     const float *weights;
-    const int *list;
-    const float *model; /* (count, 8) */
-    float *sum;
-    size_t stride;
-    int rows, count, out;
+    const int *list;    /* (blocks, list_stride) */
+    const int *count;   /* (blocks): of list */
+    const float *model; /* (blocks, stride, 8) */
+    float *sum;         /* (blocks, 5, stride) */
+    size_t stride, list_stride;
+    int rows, out, blocks;
 } disti_bound;
+
+/* The model of the rows listed of one block: with slope = sum[1..3][row], or half of that where a lane of the row is
+   dead, model[i] = m, slope, e where |x[row] - (m + slope . d)| <= e over the lanes, rounding (slack) included. */
+typedef struct disti_fit {
+    const int *list;
+    const float *x, *d; /* (., B), (3, B) */
+    const float *sum;   /* (5, stride) */
+    const uint64_t *mask;
+    float *model;       /* (count, 8) */
+    size_t stride;
+    float half[3], slack; /* |d| <= half */
+    int count, columns; /* columns: a multiple of 16 */
+} disti_fit;
 
 typedef struct disti_kernels {
     void (*gemm)(const disti_gemm *g);
+    /* gemm's bits of the `count` outputs listed alone, with ReLU and mask, whose other rows become 0 */
+    void (*gemm_some)(const disti_gemm *g, const int *list, int count);
     void (*bound)(const disti_bound *g);
-    /* top[o] = the largest of sum[1..3][o] . c + |sum[1..3][o]| . h over `cells` boxes (center c, half extents h) */
-    void (*top)(size_t out, const float *sum, size_t stride, int cells, const float *cell, float *top);
-    /* least and largest of x - slope . d over the lanes of several blocks; their number is a multiple of 16 but in the
-       last block the first `columns` count, likewise. d (blocks, 3, B), x (blocks, stride) */
-    void (*fit)(int blocks, int columns, const float *x, size_t stride, const float *d, const float *slope,
-                float *least, float *most);
+    /* top[o] = sum[0][o] + sum[4][o] + bias[o] + slack |bias[o]| + the largest of sum[1..3][o] . c + |sum[1..3][o]| . h
+       over DISTI_CELLS boxes (center c, half extents h) */
+    void (*top)(size_t out, const float *sum, size_t stride, const float *bias, float slack, const float *cell,
+                float *top);
+    void (*fit)(const disti_fit *g);
     void (*gemm_back)(const disti_gemm_back *g);
     void (*gemm_weights)(const disti_gemm_weights *g);
     /* y[c] = bias + sum_k w[k] x[k][c], c < DISTI_BLOCK, over alive rows (NULL: all): the last layer's single output */
@@ -1687,27 +1704,36 @@ typedef struct disti_kernels {
 } disti_kernels;
 
 /* The scalar kernels are the definition; the others are measured against them. */
-static void disti_gemm_scalar(const disti_gemm *g)
+static void disti_gemm_row(const disti_gemm *g, int o)
 {
     const int count = g->alive ? g->alive_count : g->rows;
-    for (int o = 0; o < (g->out + 7) / 8 * 8; o++) {
-        const float *w = g->weights + (size_t)(o / 8) * (size_t)g->rows * 8 + o % 8;
-        float *y = g->y + (size_t)o * DISTI_BLOCK;
-        for (int c = 0; c < g->columns; c++) y[c] = g->bias[o];
-        for (int i = 0; i < count; i++) {
-            const size_t k = (size_t)(g->alive ? g->alive[i] : i);
-            const float *x = g->x + k * DISTI_BLOCK;
-            for (int c = 0; c < g->columns; c++) y[c] += w[k * 8] * x[c];
-        }
-        uint64_t bits = 0;
-        for (int c = 0; c < g->columns; c++) {
-            y[c] += 0.0f; /* minus zero becomes zero, so that a zero row left out cannot show in its sign */
-            if (!g->mask && !g->relu) continue;
-            if (y[c] > 0.0f) bits |= (uint64_t)1 << c;
-            else y[c] = 0.0f;
-        }
-        if (g->mask) g->mask[o] = bits;
+    const float *w = g->weights + (size_t)(o / 8) * (size_t)g->rows * 8 + o % 8;
+    float *y = g->y + (size_t)o * DISTI_BLOCK;
+    for (int c = 0; c < g->columns; c++) y[c] = g->bias[o];
+    for (int i = 0; i < count; i++) {
+        const size_t k = (size_t)(g->alive ? g->alive[i] : i);
+        const float *x = g->x + k * DISTI_BLOCK;
+        for (int c = 0; c < g->columns; c++) y[c] += w[k * 8] * x[c];
     }
+    uint64_t bits = 0;
+    for (int c = 0; c < g->columns; c++) {
+        y[c] += 0.0f; /* minus zero becomes zero, so that a zero row left out cannot show in its sign */
+        if (!g->mask && !g->relu) continue;
+        if (y[c] > 0.0f) bits |= (uint64_t)1 << c;
+        else y[c] = 0.0f;
+    }
+    if (g->mask) g->mask[o] = bits;
+}
+
+static void disti_gemm_scalar(const disti_gemm *g)
+{
+    for (int o = 0; o < (g->out + 7) / 8 * 8; o++) disti_gemm_row(g, o);
+}
+
+static void disti_gemm_some_scalar(const disti_gemm *g, const int *list, int count)
+{
+    memset(g->mask, 0, (size_t)g->out * sizeof(uint64_t));
+    for (int i = 0; i < count; i++) disti_gemm_row(g, list[i]);
 }
 
 static void disti_gemm_back_scalar(const disti_gemm_back *g)
@@ -2016,40 +2042,53 @@ static void disti_relu_scalar(size_t rows, float *y, uint64_t *mask)
 
 static void disti_bound_scalar(const disti_bound *g)
 {
-    for (int o = 0; o < (g->out + 7) / 8 * 8; o++) {
-        const float *w = g->weights + (size_t)(o / 8) * (size_t)g->rows * 8 + o % 8;
-        float s[5] = {0, 0, 0, 0, 0};
-        for (int i = 0; i < g->count; i++) {
-            const float v = w[(size_t)g->list[i] * 8], *m = g->model + (size_t)i * 8;
-            for (int j = 0; j < 4; j++) s[j] += v * m[j];
-            s[4] += (v < 0.0f ? -v : v) * m[4];
-        }
-        for (size_t j = 0; j < 5; j++) g->sum[j * g->stride + (size_t)o] = s[j];
-    }
-}
-
-DISTI_INLINE void disti_top(size_t out, const float *DISTI_RESTRICT sum, size_t stride, int cells,
-                            const float *DISTI_RESTRICT cell, float *DISTI_RESTRICT top)
-{
-    const float *x = sum + stride, *y = x + stride, *z = y + stride;
-    for (size_t o = 0; o < out; o++) top[o] = -3e38f;
-    for (int i = 0; i < cells; i++, cell += 6) {
-        for (size_t o = 0; o < out; o++) {
-            float t = x[o] * cell[0] + y[o] * cell[1] + z[o] * cell[2] + fabsf(x[o]) * cell[3] + fabsf(y[o]) * cell[4] +
-                      fabsf(z[o]) * cell[5];
-            top[o] = t > top[o] ? t : top[o];
+    for (int b = 0; b < g->blocks; b++) {
+        const int *list = g->list + (size_t)b * g->list_stride;
+        float *sum = g->sum + (size_t)b * 5 * g->stride;
+        for (int o = 0; o < (g->out + 7) / 8 * 8; o++) {
+            const float *w = g->weights + (size_t)(o / 8) * (size_t)g->rows * 8 + o % 8;
+            const float *m = g->model + (size_t)b * g->stride * 8;
+            float s[5] = {0, 0, 0, 0, 0};
+            for (int i = 0; i < g->count[b]; i++, m += 8) {
+                const float v = w[(size_t)list[i] * 8];
+                for (int j = 0; j < 4; j++) s[j] += v * m[j];
+                s[4] += (v < 0.0f ? -v : v) * m[4];
+            }
+            for (size_t j = 0; j < 5; j++) sum[j * g->stride + (size_t)o] = s[j];
         }
     }
 }
 
-DISTI_INLINE void disti_fit(int blocks, int columns, const float *DISTI_RESTRICT x, size_t stride,
-                            const float *DISTI_RESTRICT d, const float *DISTI_RESTRICT slope, float *least, float *most)
+DISTI_INLINE void disti_top(size_t out, const float *DISTI_RESTRICT sum, size_t stride,
+                            const float *DISTI_RESTRICT bias, float slack, const float *DISTI_RESTRICT cell,
+                            float *DISTI_RESTRICT top)
 {
-    float low[16], high[16];
-    const float u = slope[0], v = slope[1], w = slope[2];
-    for (size_t c = 0; c < 16; c++) low[c] = 3e38f, high[c] = -3e38f;
-    for (int b = 0; b < blocks; b++, x += stride, d += 3 * DISTI_BLOCK) {
-        const size_t end = (size_t)(b + 1 < blocks ? (int)DISTI_BLOCK : columns);
+    const float *DISTI_RESTRICT x = sum + stride, *DISTI_RESTRICT y = x + stride, *DISTI_RESTRICT z = y + stride;
+    const float *DISTI_RESTRICT e = z + stride;
+    for (size_t o = 0; o < out; o++) {
+        const float u = fabsf(x[o]), v = fabsf(y[o]), w = fabsf(z[o]);
+        float most = -3e38f;
+        for (size_t i = 0; i < 6 * DISTI_CELLS; i += 6) {
+            float t = x[o] * cell[i] + y[o] * cell[i + 1] + z[o] * cell[i + 2] + u * cell[i + 3] + v * cell[i + 4] +
+                      w * cell[i + 5];
+            most = t > most ? t : most;
+        }
+        top[o] = most + sum[o] + bias[o] + e[o] + slack * fabsf(bias[o]);
+    }
+}
+
+DISTI_INLINE void disti_fit_rows(const disti_fit *g)
+{
+    const float *DISTI_RESTRICT d = g->d;
+    const uint64_t full = ((uint64_t)1 << g->columns) - 1;
+    const size_t end = (size_t)g->columns;
+    for (int i = 0; i < g->count; i++) {
+        const size_t row = (size_t)g->list[i];
+        const float *DISTI_RESTRICT x = g->x + row * DISTI_BLOCK, factor = g->mask[row] == full ? 1.0f : 0.5f;
+        const float *s = g->sum + g->stride + row;
+        const float u = factor * s[0], v = factor * s[g->stride], w = factor * s[2 * g->stride];
+        float low[16], high[16], *m = g->model + (size_t)i * 8;
+        for (size_t c = 0; c < 16; c++) low[c] = 3e38f, high[c] = -3e38f;
         for (size_t at = 0; at < end; at += 16) {
             for (size_t c = 0; c < 16; c++) {
                 const float *p = d + at + c;
@@ -2058,12 +2097,23 @@ DISTI_INLINE void disti_fit(int blocks, int columns, const float *DISTI_RESTRICT
                 high[c] = r > high[c] ? r : high[c];
             }
         }
-    }
-    *least = low[0];
-    *most = high[0];
-    for (int c = 1; c < 16; c++) {
-        *least = DISTI_MIN(*least, low[c]);
-        *most = DISTI_MAX(*most, high[c]);
+        for (size_t c = 0; c < 8; c++) {
+            low[c] = low[c] < low[c + 8] ? low[c] : low[c + 8];
+            high[c] = high[c] > high[c + 8] ? high[c] : high[c + 8];
+        }
+        for (size_t c = 0; c < 4; c++) {
+            low[c] = low[c] < low[c + 4] ? low[c] : low[c + 4];
+            high[c] = high[c] > high[c + 4] ? high[c] : high[c + 4];
+        }
+        const float least = DISTI_MIN(DISTI_MIN(low[0], low[1]), DISTI_MIN(low[2], low[3]));
+        const float most = DISTI_MAX(DISTI_MAX(high[0], high[1]), DISTI_MAX(high[2], high[3]));
+        const float middle = 0.5f * (least + most), range = DISTI_MAX(most - middle, middle - least);
+        const float reach = fabsf(u) * g->half[0] + fabsf(v) * g->half[1] + fabsf(w) * g->half[2];
+        m[0] = middle;
+        m[1] = u;
+        m[2] = v;
+        m[3] = w;
+        m[4] = range + g->slack * (range + reach + fabsf(middle));
     }
 }
 
@@ -2112,16 +2162,12 @@ DISTI_INLINE void disti_points(const float *DISTI_RESTRICT rows, float *DISTI_RE
     {                                                                                                                  \
         disti_axpy(n, s, x, y);                                                                                        \
     }                                                                                                                  \
-    function void disti_top_##isa(size_t out, const float *sum, size_t stride, int cells, const float *cell,           \
-                                   float *top)                                                                         \
+    function void disti_top_##isa(size_t out, const float *sum, size_t stride, const float *bias, float slack,         \
+                                   const float *cell, float *top)                                                      \
     {                                                                                                                  \
-        disti_top(out, sum, stride, cells, cell, top);                                                                 \
+        disti_top(out, sum, stride, bias, slack, cell, top);                                                           \
     }                                                                                                                  \
-    function void disti_fit_##isa(int blocks, int columns, const float *x, size_t stride, const float *d,              \
-                                   const float *slope, float *least, float *most)                                      \
-    {                                                                                                                  \
-        disti_fit(blocks, columns, x, stride, d, slope, least, most);                                                  \
-    }
+    function void disti_fit_##isa(const disti_fit *g) { disti_fit_rows(g); }
 DISTI_PLAIN(scalar, static)
 
 #if defined(DISTI_X86) || defined(DISTI_NEON)
@@ -2248,6 +2294,32 @@ DISTI_PLAIN(scalar, static)
         } else {                                                                                                       \
             DISTI_Y##R(DISTI_STORE_POSITIVE, V)                                                                        \
         }                                                                                                              \
+    }
+
+/* As above for outputs that stand in a list, with ReLU: o; from `count` on they repeat the last one. */
+#define DISTI_PLACE(i, V) const size_t k##i = (size_t)(unsigned)(o[i] >> 3) * panel + (size_t)(unsigned)(o[i] & 7);
+#define DISTI_SOME_STORE1(i, j)                                                                                        \
+    a##i##j = DISTI_ADD(a##i##j, b);                                                                                   \
+    DISTI_BITS(mask, c + j * DISTI_LANES, a##i##j)                                                                     \
+    DISTI_STORE(y + j * DISTI_LANES, DISTI_RELU(a##i##j));
+#define DISTI_SOME_STORE(i, V)                                                                                         \
+    if (i < count) {                                                                                                   \
+        const DISTI_VEC b = DISTI_SET1(g->bias[o[i]]);                                                                 \
+        uint64_t *mask = g->mask + o[i];                                                                               \
+        float *y = g->y + (size_t)(unsigned)o[i] * DISTI_BLOCK + c;                                                    \
+        DISTI_X##V(DISTI_SOME_STORE1, i)                                                                               \
+    }
+#define DISTI_SOME_TILE(name, R, V)                                                                                    \
+    DISTI_NOINLINE DISTI_FUNCTION void disti_some_##name(const disti_gemm *g, const int *o, int count, int c)          \
+    {                                                                                                                  \
+        const size_t panel = (size_t)(unsigned)g->rows * 8;                                                            \
+        const float *w = g->weights, *x = g->x + c;                                                                    \
+        const int *k = g->alive, *const end = k + g->alive_count;                                                      \
+        DISTI_Y##R(DISTI_PLACE, V)                                                                                     \
+        DISTI_Y##R(DISTI_ZERO, V)                                                                                      \
+        for (; k < end; k++)                                                                                           \
+            DISTI_STEP(R, V, DISTI_APART, w + (size_t)(unsigned)*k * 8, x + (size_t)(unsigned)*k * DISTI_BLOCK)        \
+        DISTI_Y##R(DISTI_SOME_STORE, V)                                                                                \
     }
 
 /* k: the rows of this tile; from `count` on they repeat the last one and are not stored. */
@@ -2437,6 +2509,14 @@ DISTI_PLAIN(scalar, static)
         if (!g->mask || g->columns == DISTI_BLOCK) return;                                                             \
         for (int o = 0; o < out; o++) g->mask[o] &= ((uint64_t)1 << g->columns) - 1;                                   \
     }                                                                                                                  \
+    DISTI_FUNCTION void disti_gemm_some_##isa(const disti_gemm *g, const int *list, int count)                         \
+    {                                                                                                                  \
+        int o[8];                                                                                                      \
+        memset(g->mask, 0, (size_t)(unsigned)g->out * sizeof(uint64_t));                                               \
+        DISTI_EACH(some, isa, 0, count, g->columns, R, W, (g, disti_listed(list, count, n, o), count - n, c))          \
+        if (g->columns == DISTI_BLOCK) return;                                                                         \
+        for (int i = 0; i < count; i++) g->mask[list[i]] &= ((uint64_t)1 << g->columns) - 1;                           \
+    }\
     DISTI_FUNCTION void disti_gemm_back_##isa(const disti_gemm_back *g)                                                \
     {                                                                                                                  \
         const int rows = g->alive_rows ? g->alive_rows_count : g->rows;                                                \
@@ -2468,32 +2548,41 @@ DISTI_PLAIN(scalar, static)
         }                                                                                                              \
     }
 
-/* Two vectors of outputs at a time: of two panels, or of one where a vector is half a panel. */
+/* Two vectors of outputs at a time: of one panel, of two, of four. */
 #define DISTI_BOUND1(j)                                                                                                \
     { const DISTI_VEC b = DISTI_SET1(m[j]); DISTI_FMA(a0##j, b, v); DISTI_FMA(a1##j, b, w); }
 #define DISTI_BOUND_ZERO(j) DISTI_VEC a0##j = DISTI_SET1(0.0f), a1##j = DISTI_SET1(0.0f);
-#define DISTI_BOUND_STORE(j) DISTI_STORE(s + j * g->stride, a0##j); DISTI_STORE(t + j * g->stride, a1##j);
+#define DISTI_BOUND_STORE(j)                                                                                           \
+    DISTI_TWO_STORE(sum + j * g->stride + at0, sum + j * g->stride + at2, a0##j)                                       \
+    DISTI_TWO_STORE(sum + j * g->stride + at1, sum + j * g->stride + at3, a1##j)
 #define DISTI_BOUND(isa)                                                                                               \
     DISTI_NOINLINE DISTI_FUNCTION void disti_bound_##isa(const disti_bound *g)                                         \
     {                                                                                                                  \
-        const int panels = (g->out + 7) / 8;                                                                           \
-        const size_t panel = (size_t)g->rows * 8;                                                                      \
-        for (int p = 0; p < panels; p += DISTI_LANES / 4) {                                                            \
-            const size_t other = (size_t)(unsigned)(DISTI_LANES == 8 ? DISTI_MIN(p + 1, panels - 1) : p);              \
-            const size_t half = DISTI_LANES == 8 ? 0 : 4;                                                              \
-            const float *w0 = g->weights + (size_t)(unsigned)p * panel, *w1 = g->weights + other * panel + half;       \
-            const float *m = g->model;                                                                                 \
-            float *s = g->sum + (size_t)(unsigned)p * 8, *t = g->sum + other * 8 + half;                               \
-            DISTI_BOUND_ZERO(0) DISTI_BOUND_ZERO(1) DISTI_BOUND_ZERO(2) DISTI_BOUND_ZERO(3) DISTI_BOUND_ZERO(4)        \
-            for (const int *k = g->list, *end = k + g->count; k < end; k++, m += 8) {                                  \
-                DISTI_VEC v = DISTI_LOAD(w0 + (size_t)(unsigned)*k * 8);                                               \
-                DISTI_VEC w = DISTI_LOAD(w1 + (size_t)(unsigned)*k * 8);                                               \
-                DISTI_BOUND1(0) DISTI_BOUND1(1) DISTI_BOUND1(2) DISTI_BOUND1(3)                                        \
-                v = DISTI_ABS(v);                                                                                      \
-                w = DISTI_ABS(w);                                                                                      \
-                DISTI_BOUND1(4)                                                                                        \
+        const int last = (g->out + 7) / 8 - 1;                                                                         \
+        const size_t rows = (size_t)(unsigned)g->rows;                                                                 \
+        for (int p = 0; p <= last; p += DISTI_LANES / 4) {                                                             \
+            const size_t at0 = (size_t)(unsigned)p * 8, at2 = (size_t)(unsigned)DISTI_MIN(p + 1, last) * 8;            \
+            const size_t at1 = DISTI_LANES == 4 ? at0 + 4                                                              \
+                                                : (size_t)(unsigned)DISTI_MIN(p + DISTI_LANES / 8, last) * 8;          \
+            const size_t at3 = (size_t)(unsigned)DISTI_MIN(p + 3, last) * 8;                                           \
+            const float *w0 = g->weights + at0 * rows, *w1 = g->weights + (at1 & ~(size_t)7) * rows + (at1 & 7);       \
+            const float *w2 = g->weights + at2 * rows, *w3 = g->weights + at3 * rows;                                  \
+            for (size_t block = 0; block < (size_t)(unsigned)g->blocks; block++) {                                     \
+                const float *m = g->model + block * g->stride * 8;                                                     \
+                const int *k = g->list + block * g->list_stride, *end = k + g->count[block];                           \
+                float *sum = g->sum + block * 5 * g->stride;                                                           \
+                DISTI_BOUND_ZERO(0) DISTI_BOUND_ZERO(1) DISTI_BOUND_ZERO(2) DISTI_BOUND_ZERO(3) DISTI_BOUND_ZERO(4)    \
+                for (; k < end; k++, m += 8) {                                                                         \
+                    const size_t row = (size_t)(unsigned)*k * 8;                                                       \
+                    DISTI_VEC v = DISTI_TWO(w0 + row, w2 + row), w = DISTI_TWO(w1 + row, w3 + row);                    \
+                    DISTI_BOUND1(0) DISTI_BOUND1(1) DISTI_BOUND1(2) DISTI_BOUND1(3)                                    \
+                    v = DISTI_ABS(v);                                                                                  \
+                    w = DISTI_ABS(w);                                                                                  \
+                    DISTI_BOUND1(4)                                                                                    \
+                }                                                                                                      \
+                DISTI_BOUND_STORE(0) DISTI_BOUND_STORE(1) DISTI_BOUND_STORE(2) DISTI_BOUND_STORE(3)                    \
+                DISTI_BOUND_STORE(4)                                                                                   \
             }                                                                                                          \
-            DISTI_BOUND_STORE(0) DISTI_BOUND_STORE(1) DISTI_BOUND_STORE(2) DISTI_BOUND_STORE(3) DISTI_BOUND_STORE(4)   \
         }                                                                                                              \
     }
 
@@ -2501,6 +2590,9 @@ DISTI_PLAIN(scalar, static)
     DISTI_GEMM_TILE(wide_##isa, R, W, DISTI_SIDE)                                                                      \
     DISTI_GEMM_TILE(middle_##isa, 8, 2, DISTI_SIDE)                                                                    \
     DISTI_GEMM_TILE(narrow_##isa, 8, 1, DISTI_SIDE)                                                                    \
+    DISTI_SOME_TILE(wide_##isa, R, W)                                                                                  \
+    DISTI_SOME_TILE(middle_##isa, 8, 2)                                                                                \
+    DISTI_SOME_TILE(narrow_##isa, 8, 1)                                                                                \
     DISTI_BACK_TILE(wide_##isa, R, W)                                                                                  \
     DISTI_BACK_TILE(middle_##isa, 8, 2)                                                                                \
     DISTI_BACK_TILE(narrow_##isa, 8, 1)                                                                                \
@@ -2508,17 +2600,23 @@ DISTI_PLAIN(scalar, static)
     DISTI_WEIGHTS_TILE(middle_##isa, 8, 2)                                                                             \
     DISTI_WEIGHTS_TILE(narrow_##isa, 8, 1)                                                                             \
     DISTI_LAST_LAYER(isa)                                                                                              \
+    DISTI_BOUND(isa)                                                                                                   \
     DISTI_RELU_ROWS(isa)                                                                                               \
     DISTI_PLAIN(isa, DISTI_LOOPS DISTI_FUNCTION)                                                                       \
     DISTI_DRIVERS(isa, R, W)
 
-/* The eight rows of d_x that begin at the list's entry n; beyond its end the last one again. */
+/* The eight entries of a list that begin at n; beyond its end the last one again. */
+static const int *disti_listed(const int *list, int count, int n, int *eight)
+{
+    for (int i = 0; i < 8; i++) eight[i] = list[DISTI_MIN(n + i, count - 1)];
+    return eight;
+}
+
+/* The eight rows of d_x that begin at the list's entry n. */
 static const int *disti_back_rows(const disti_gemm_back *g, int rows, int n, int *k)
 {
-    for (int i = 0; i < 8; i++) {
-        const int row = DISTI_MIN(n + i, rows - 1);
-        k[i] = g->alive_rows ? g->alive_rows[row] : row;
-    }
+    if (g->alive_rows) return disti_listed(g->alive_rows, rows, n, k);
+    for (int i = 0; i < 8; i++) k[i] = DISTI_MIN(n + i, rows - 1);
     return k;
 }
 
@@ -2545,9 +2643,10 @@ DISTI_FUNCTION __m128 disti_keep_sse2(__m128 v, int bits)
 #define DISTI_TALL(isa)
 #define DISTI_FEW(isa)
 #define DISTI_DEPTH 112
-DISTI_KERNELS(sse2, 4, 2)
 #define DISTI_ABS(v) _mm_andnot_ps(_mm_set1_ps(-0.0f), v)
-DISTI_BOUND(sse2)
+#define DISTI_TWO(p, q) ((void)(q), DISTI_LOAD(p))
+#define DISTI_TWO_STORE(p, q, v) (void)(q); DISTI_STORE(p, v);
+DISTI_KERNELS(sse2, 4, 2)
 #undef DISTI_ABS
 #undef DISTI_FUNCTION
 #undef DISTI_VEC
@@ -2586,10 +2685,11 @@ DISTI_FUNCTION __m256 disti_keep_avx2(__m256 v, int bits)
     return _mm256_and_ps(v, _mm256_castsi256_ps(_mm256_cmpeq_epi32(both, lane)));
 }
 #define DISTI_DEPTH 176
-DISTI_KERNELS(avx2, 4, 3)
 #define DISTI_ABS(v) _mm256_andnot_ps(_mm256_set1_ps(-0.0f), v)
-DISTI_BOUND(avx2)
+DISTI_KERNELS(avx2, 4, 3)
 #undef DISTI_ABS
+#undef DISTI_TWO
+#undef DISTI_TWO_STORE
 #undef DISTI_TALL
 #undef DISTI_FEW
 #undef DISTI_FUNCTION
@@ -2636,7 +2736,14 @@ DISTI_GEMM_TILE(tall_avx512, 16, 1, DISTI_ABOVE)
         continue;                                                                                                      \
     }
 DISTI_BACK_TILE(few_avx512, 4, 3)
+#define DISTI_ABS(v) _mm512_andnot_ps(_mm512_set1_ps(-0.0f), v)
+#define DISTI_TWO(p, q) _mm512_insertf32x8(_mm512_castps256_ps512(_mm256_loadu_ps(p)), _mm256_loadu_ps(q), 1)
+#define DISTI_TWO_STORE(p, q, v) \
+    _mm256_storeu_ps(p, _mm512_castps512_ps256(v)); _mm256_storeu_ps(q, _mm512_extractf32x8_ps(v, 1));
 DISTI_KERNELS(avx512, 8, 3)
+#undef DISTI_ABS
+#undef DISTI_TWO
+#undef DISTI_TWO_STORE
 #undef DISTI_TALL
 #undef DISTI_FEW
 
@@ -2924,10 +3031,13 @@ static float32x4_t disti_keep_neon(float32x4_t v, uint32_t bits)
 #define DISTI_TALL(isa)
 #define DISTI_FEW(isa)
 #define DISTI_DEPTH 112
-DISTI_KERNELS(neon, 8, 3)
 #define DISTI_ABS(v) vabsq_f32(v)
-DISTI_BOUND(neon)
+#define DISTI_TWO(p, q) ((void)(q), DISTI_LOAD(p))
+#define DISTI_TWO_STORE(p, q, v) (void)(q); DISTI_STORE(p, v);
+DISTI_KERNELS(neon, 8, 3)
 #undef DISTI_ABS
+#undef DISTI_TWO
+#undef DISTI_TWO_STORE
 #endif
 #endif
 
@@ -2956,6 +3066,8 @@ static uint32_t disti_f16_bits(float x) /* not called: dist_net_set_half refuses
     kernels.points = disti_points_##isa; \
     kernels.relu = disti_relu_##isa; \
     kernels.activate = disti_activate_##isa; \
+    kernels.gemm_some = disti_gemm_some_##isa; \
+    kernels.bound = disti_bound_##isa; \
     kernels.top = disti_top_##isa; \
     kernels.fit = disti_fit_##isa; \
     kernels.norm = disti_norm_##isa; \
@@ -2966,16 +3078,13 @@ static disti_kernels disti_kernels_for(int isa)
 {
     disti_kernels kernels;
     DISTI_TABLE(scalar)
-    kernels.bound = disti_bound_scalar;
 #ifdef DISTI_X86
     if (isa == DIST_ISA_SSE2) { DISTI_TABLE(sse2) }
     if (isa == DIST_ISA_AVX2) { DISTI_TABLE(avx2) }
     if (isa == DIST_ISA_AVX512) { DISTI_TABLE(avx512) }
-    if (isa == DIST_ISA_SSE2) kernels.bound = disti_bound_sse2;
-    if (isa == DIST_ISA_AVX2 || isa == DIST_ISA_AVX512) kernels.bound = disti_bound_avx2;
 #endif
 #ifdef DISTI_NEON
-    if (isa == DIST_ISA_NEON) { DISTI_TABLE(neon) kernels.bound = disti_bound_neon; }
+    if (isa == DIST_ISA_NEON) { DISTI_TABLE(neon) }
 #endif
     (void)isa;
     return kernels;
@@ -3031,6 +3140,10 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_EACH
 #undef DISTI_DRIVERS
 #undef DISTI_KERNELS
+#undef DISTI_PLACE
+#undef DISTI_SOME_STORE1
+#undef DISTI_SOME_STORE
+#undef DISTI_SOME_TILE
 #undef DISTI_BOUND
 #undef DISTI_BOUND1
 #undef DISTI_BOUND_ZERO
@@ -5330,7 +5443,6 @@ typedef struct disti_block {
     int channel, channels; /* the output's channels that the reverse pass starts from: the distance, or r, g, b */
     int half; /* 0; or B / 2: lane c + half is the tangent of lane c, see disti_second_block */
     disti_kernels kernels;
-    const float *last; /* the output channel's weights for the rows at hand; NULL: as the net has them */
 } disti_block;
 
 /* Returns the bytes needed; base NULL: only that. Sizes are bounded by 32 layers of 8192 + 99 rows. */
@@ -5647,7 +5759,7 @@ static void disti_net_output(const dist_shape *shape, const disti_block *b, cons
     int rows = layer->prev + layer->point;
     const int *alive = b->alive_count[l] < rows ? b->alive + (size_t)l * (size_t)net->max_rows : NULL;
     float bias = shape->bias[(size_t)l * (size_t)net->max_rows + (size_t)channel];
-    const float *w = b->last ? b->last : net->panels + layer->panel + (size_t)channel * (size_t)rows;
+    const float *w = net->panels + layer->panel + (size_t)channel * (size_t)rows;
     b->kernels.dot(w, b->half ? 0.0f : bias, x, alive, b->alive_count[l], rows, b->columns, value);
     float v[DISTI_BLOCK], d[DISTI_BLOCK], t[DISTI_BLOCK], bend[DISTI_BLOCK];
     float level = channel == net->sdf_channel ? net->level : 0.0f;
@@ -5920,6 +6032,229 @@ static void disti_fold_sum(const dist_shape *shape, disti_block *b, const float 
     if (index % 16 == 15) disti_fold_flush(net, b);
 }
 
+/* Rows left out, too. A unit's pre-activation a(p) = b + sum_k w_k x_k(p) over a block of neighboring points is bounded
+   from what the layer's inputs were there: with x_k(p) = A_k + J_k . (p - c) + e_k(p), |e_k| <= E_k, where J_k is
+   whatever seems right and A_k and E_k are then the middle and half the range of x_k - J_k . (p - c) over the block,
+
+     a(p) <= b + sum_k w_k A_k + max_p (sum_k w_k J_k) . (p - c) + sum_k |w_k| E_k
+
+   The bound asks nothing of the layers before, whose outputs are known, so it does not loosen with depth. It costs five
+   columns; the maximum is taken over boxes around a dozen points each. A unit for which it is negative is dead over the
+   block and is not computed; rounding, of the sums here and of those left out, each at most 2 (K + 4) 2^-24 times the
+   sum of the magnitudes of its K terms, is in E_k. So no bit of any result changes.
+   J of a unit that is alive all over the block is sum_k w_k J_k; of one that changes sign, half of it.
+   Up to four blocks go through each layer together, so that its weights come from memory once. */
+enum {
+    DISTI_GROUP = 4,
+    DISTI_GROUP_POINTS = (int)DISTI_GROUP * DISTI_BLOCK,
+    DISTI_GROUP_LEAST = 2 * DISTI_BLOCK, /* points: of fewer, bounds cost more than they save */
+    DISTI_SORTED = 8 * (int)DISTI_GROUP_POINTS /* points put in order at once */
+};
+
+typedef struct disti_place { /* a point, and which it is */
+    float p[3];
+    int at;
+} disti_place;
+
+typedef struct disti_group {
+    float *x[2][DISTI_GROUP]; /* (max_rows, B) each: a layer's input, of which alive rows and the point's are written */
+    float *point, *away; /* (GROUP, 3, B): the points, and from their block's center */
+    float *model;    /* (GROUP, max_rows, 8): of those rows, see disti_fit */
+    float *sum;      /* (GROUP, 5, max_rows): of each output, see disti_bound */
+    float *top;      /* max_rows: of each output the bound */
+    int *unit;       /* max_rows: those that are computed */
+    uint64_t *mask;  /* (GROUP, layers, max_rows): as disti_block has them */
+    int *alive;      /* (GROUP, layers, max_rows) */
+    float *value;    /* (GROUP, 3, B): value, slope, curvature */
+    disti_place *place; /* DISTI_SORTED: points in order */
+    float *points;   /* (GROUP_POINTS, 3), in that order */
+    float cell[DISTI_GROUP][6 * DISTI_CELLS], center[DISTI_GROUP][3], half[DISTI_GROUP][3];
+    int alive_count[DISTI_GROUP][DISTI_MAX_LAYERS], alive_units[DISTI_GROUP][DISTI_MAX_LAYERS];
+    int count[DISTI_GROUP]; /* of each block's points */
+    int blocks;
+} disti_group;
+
+/* Returns the bytes needed, as disti_block_layout does; b: the worker's block, whose activations it shares. */
+static size_t disti_group_layout(const dist_net *net, unsigned char *base, const disti_block *b, disti_group *g)
+{
+    size_t at = 0, rows = (size_t)net->max_rows, row = DISTI_BLOCK * sizeof(float), all = (size_t)net->layers * rows;
+    memset(g, 0, sizeof *g);
+    for (int j = 0; j < DISTI_GROUP; j++) { /* a reverse pass begins when these are done with */
+        g->x[0][j] = j < 2 ? b->act[j] : b->delta[j - 2];
+        if (j >= net->fold_count) g->x[1][j] = (float *)disti_take(base, &at, rows, row);
+        else g->x[1][j] = base ? b->fold_delta + (size_t)j * rows * DISTI_BLOCK : NULL;
+    }
+    g->point = (float *)disti_take(base, &at, DISTI_GROUP * 3, row);
+    g->away = (float *)disti_take(base, &at, DISTI_GROUP * 3, row);
+    g->model = (float *)disti_take(base, &at, DISTI_GROUP * rows * 8, sizeof(float));
+    g->sum = (float *)disti_take(base, &at, DISTI_GROUP * rows * 5, sizeof(float));
+    g->top = (float *)disti_take(base, &at, rows, sizeof(float));
+    g->unit = (int *)disti_take(base, &at, rows, sizeof(int));
+    g->mask = (uint64_t *)disti_take(base, &at, DISTI_GROUP * all, sizeof(uint64_t));
+    g->alive = (int *)disti_take(base, &at, DISTI_GROUP * all, sizeof(int));
+    g->value = (float *)disti_take(base, &at, DISTI_GROUP * 3, row);
+    g->place = (disti_place *)disti_take(base, &at, DISTI_SORTED, sizeof(disti_place));
+    g->points = (float *)disti_take(base, &at, DISTI_GROUP_POINTS * 3, sizeof(float));
+    return at;
+}
+
+/* Whether it is tried: wide nets of units that can be dead and of inputs that are the point itself. */
+static int disti_net_groups(const dist_context *ctx, const dist_net *net)
+{
+    int narrow = net->max_rows;
+    for (int l = 0; l + 1 < net->layers; l++) narrow = DISTI_MIN(narrow, net->layer[l].out);
+    return net->activation == DIST_ACTIVATION_RELU && !net->normed && net->levels == 0 && net->layers > 2 &&
+           narrow >= 96 && net->max_rows <= 1100 && (!ctx->blas.sgemm_fn || narrow < ctx->blas_width);
+}
+
+/* Makes the group of n points (n, 3) ready: their rows, idle lanes repeating the last point, and their boxes. */
+static void disti_group_begin(disti_group *g, int n, const float *points)
+{
+    g->blocks = (n + DISTI_BLOCK - 1) / DISTI_BLOCK;
+    for (int j = 0; j < g->blocks; j++, points += 3 * DISTI_BLOCK) {
+        int count = DISTI_MIN(n - j * DISTI_BLOCK, (int)DISTI_BLOCK);
+        float *point = g->point + j * 3 * DISTI_BLOCK, *away = g->away + j * 3 * DISTI_BLOCK;
+        g->count[j] = count;
+        for (int k = 0; k < 3; k++) {
+            float low = 3e38f, high = -3e38f, *to = point + k * DISTI_BLOCK;
+            for (int i = 0; i < count; i++) {
+                to[i] = points[3 * i + k];
+                low = DISTI_MIN(low, to[i]);
+                high = DISTI_MAX(high, to[i]);
+            }
+            for (int i = count; i < DISTI_BLOCK; i++) to[i] = to[count - 1];
+            g->center[j][k] = 0.5f * (low + high);
+            g->half[j][k] = 0.50001f * (high - low);
+            for (int i = 0; i < DISTI_BLOCK; i++) away[k * DISTI_BLOCK + i] = to[i] - g->center[j][k];
+            for (int i = 0; i < DISTI_CELLS; i++) {
+                float least = 3e38f, most = -3e38f;
+                for (int c = i * DISTI_CELL_POINTS; c < (i + 1) * DISTI_CELL_POINTS; c++) {
+                    least = DISTI_MIN(least, away[k * DISTI_BLOCK + c]);
+                    most = DISTI_MAX(most, away[k * DISTI_BLOCK + c]);
+                }
+                g->cell[j][6 * i + k] = 0.5f * (least + most);
+                g->cell[j][6 * i + 3 + k] = 0.50001f * (most - least);
+            }
+        }
+    }
+}
+
+/* Layer l's input of block j, of which `units` rows listed in g->unit were computed: the list of the alive ones, then
+   the point's, which it writes, and their model. */
+static void disti_group_input(const dist_shape *shape, const disti_kernels *kernels, disti_group *g, int l, int j,
+                              int units, float slack)
+{
+    const dist_net *net = shape->net;
+    const disti_linear *layer = &net->layer[l];
+    size_t width = (size_t)net->max_rows, at = ((size_t)j * (size_t)net->layers + (size_t)l) * width;
+    float *x = g->x[l & 1][j], *model = g->model + (size_t)j * width * 8;
+    const float *point = g->point + j * 3 * DISTI_BLOCK;
+    uint64_t *mask = g->mask + at;
+    int *alive = g->alive + at, count = 0;
+    const int *unit = g->unit;
+    for (int i = 0; i < units; i++) {
+        alive[count] = unit[i];
+        count += mask[unit[i]] != 0;
+    }
+    disti_fit fit;
+    fit.list = alive;
+    fit.x = x;
+    fit.d = g->away + j * 3 * DISTI_BLOCK;
+    fit.sum = g->sum + (size_t)j * 5 * width;
+    fit.mask = mask;
+    fit.model = model;
+    fit.stride = width;
+    memcpy(fit.half, g->half[j], sizeof fit.half);
+    fit.slack = slack;
+    fit.count = count;
+    fit.columns = (g->count[j] + 15) / 16 * 16;
+    kernels->fit(&fit);
+    g->alive_units[j][l] = count;
+    for (int i = 0; i < layer->point; i++, count++) {
+        float *m = model + (size_t)count * 8, c = g->center[j][i];
+        alive[count] = layer->prev + i;
+        mask[layer->prev + i] = ~(uint64_t)0;
+        memcpy(x + (size_t)(layer->prev + i) * DISTI_BLOCK, point + i * DISTI_BLOCK, DISTI_BLOCK * sizeof(float));
+        m[0] = c;
+        for (int k = 0; k < 3; k++) m[1 + k] = i == k ? 1.0f : 0.0f;
+        m[4] = slack * (g->half[j][i] + fabsf(c));
+    }
+    g->alive_count[j][l] = count;
+}
+
+/* All hidden layers of a group of n points; disti_group_block then gives its blocks. Returns the multiply-adds. */
+static double disti_group_forward(const dist_shape *shape, const disti_kernels *kernels, disti_group *g, int n,
+                                  const float *points)
+{
+    const dist_net *net = shape->net;
+    int last = net->layers - 1, count[DISTI_GROUP];
+    float slack = 5e-7f * (float)(net->max_rows + 16); /* twice 4 (K + 4) 2^-24 */
+    double done = 0.0;
+    size_t width = (size_t)net->max_rows, all = (size_t)net->layers * width;
+    disti_group_begin(g, n, points);
+    for (int j = 0; j < g->blocks; j++) disti_group_input(shape, kernels, g, 0, j, 0, slack);
+    for (int l = 0; l < last; l++) {
+        const disti_linear *layer = &net->layer[l];
+        const float *bias = shape->bias + (size_t)l * width;
+        disti_bound bound;
+        for (int j = 0; j < g->blocks; j++) count[j] = g->alive_count[j][l];
+        bound.weights = net->panels + layer->panel;
+        bound.list = g->alive + (size_t)l * width;
+        bound.count = count;
+        bound.model = g->model;
+        bound.sum = g->sum;
+        bound.stride = width;
+        bound.list_stride = all;
+        bound.rows = layer->prev + layer->point;
+        bound.out = layer->out;
+        bound.blocks = g->blocks;
+        kernels->bound(&bound);
+        for (int j = 0; j < g->blocks; j++) {
+            size_t block = (size_t)j * width, at = (size_t)j * all + (size_t)l * width;
+            const float *top = g->top;
+            int units = 0, out = layer->out, *unit = g->unit;
+            disti_gemm m;
+            kernels->top((size_t)out, g->sum + 5 * block, width, bias, slack, g->cell[j], g->top);
+            for (int o = 0; o < out; o++) { /* what is not finite comes out as without */
+                unit[units] = o;
+                units += (int)!(top[o] < 0.0f) | (int)!(top[o] > -3e38f);
+            }
+            m.weights = bound.weights;
+            m.bias = bias;
+            m.x = g->x[l & 1][j];
+            m.y = g->x[(l + 1) & 1][j];
+            m.alive = g->alive + at;
+            m.alive_count = count[j];
+            m.mask = g->mask + at + width;
+            m.rows = bound.rows;
+            m.out = out;
+            m.columns = (g->count[j] + 15) / 16 * 16;
+            m.relu = 1;
+            kernels->gemm_some(&m, unit, units);
+            done += (double)count[j] * (5.0 * (double)layer->out + (double)units * (double)g->count[j]);
+            disti_group_input(shape, kernels, g, l + 1, j, units, slack);
+        }
+    }
+    for (int j = 0; j < g->blocks; j++) done += (double)g->alive_count[j][last] * (double)g->count[j];
+    return done;
+}
+
+/* Block j of the group to a copy of the worker's block. Returns the last layer's input. */
+static const float *disti_group_block(const dist_net *net, const disti_group *g, int j, disti_block *b)
+{
+    size_t width = (size_t)net->max_rows, at = (size_t)j * (size_t)net->layers * width;
+    b->point = g->point + j * 3 * DISTI_BLOCK;
+    b->mask = g->mask + at;
+    b->alive = g->alive + at;
+    b->value = g->value + j * 3 * DISTI_BLOCK;
+    b->value_slope = b->value + DISTI_BLOCK;
+    b->value_curvature = b->value_slope + DISTI_BLOCK;
+    memcpy(b->alive_count, g->alive_count[j], sizeof b->alive_count);
+    memcpy(b->alive_units, g->alive_units[j], sizeof b->alive_units);
+    b->columns = g->count[j];
+    return g->x[(net->layers - 1) & 1][j];
+}
+
 /* dist_field.fused_fn of a net. The reverse pass runs from f's own slope (seed 1), so that it leaves grad f; delta
    is linear in the seed, so the seeds may come afterwards: d_code needs only sum_c seed[c] delta[.][c]. */
 static void disti_shape_fused(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient,
@@ -5927,15 +6262,40 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
 {
     const dist_shape *shape = (const dist_shape *)user;
     const dist_net *net = shape->net;
-    disti_block b;
-    disti_blocks_begin(shape, worker, &b, n);
-    b.values = !gradient && !seed_fn;
-    if (d_code) disti_fold_begin(net, &b);
-    for (size_t at = 0; at < n; at += DISTI_BLOCK) {
+    disti_counter *counter = disti_counter_of(shape->ctx, worker);
+    disti_block own, b;
+    disti_group g;
+    int blocks = 0, j = 0;
+    disti_blocks_begin(shape, worker, &own, n);
+    own.values = !gradient && !seed_fn;
+    own.channel = net->sdf_channel;
+    own.channels = 1;
+    if (shape->groups) {
+        size_t bytes = disti_block_layout(net, NULL, &b);
+        disti_group_layout(net, disti_lane(shape->ctx, worker) + bytes, &own, &g);
+    }
+    if (d_code) disti_fold_begin(net, &own);
+    for (size_t at = 0; at < n; at += DISTI_BLOCK, j++) {
         size_t count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK);
-        disti_block_load(shape, &b, count, points + 3 * at);
-        const float *x = disti_net_forward(shape, &b, NULL, disti_counter_of(shape->ctx, worker));
-        disti_net_output(shape, &b, x, net->sdf_channel);
+        if (j == blocks && shape->groups && n - at >= DISTI_GROUP_LEAST) {
+            int part = (int)DISTI_MIN(n - at, (size_t)DISTI_GROUP_POINTS);
+            counter->done += disti_group_forward(shape, &own.kernels, &g, part, points + 3 * at);
+            blocks = g.blocks;
+            for (j = 0; j < blocks; j++) { /* all, before a reverse pass takes the memory of their inputs */
+                b = own;
+                const float *x = disti_group_block(net, &g, j, &b);
+                disti_net_output(shape, &b, x, net->sdf_channel);
+            }
+            j = 0;
+        }
+        b = own;
+        if (j < blocks) {
+            disti_group_block(net, &g, j, &b);
+        } else {
+            disti_block_load(shape, &b, count, points + 3 * at);
+            const float *x = disti_net_forward(shape, &b, NULL, counter);
+            disti_net_output(shape, &b, x, net->sdf_channel);
+        }
         if (sdf) memcpy(sdf + at, b.value, count * sizeof(float));
         if (b.values) continue;
         disti_net_reverse(shape, &b, b.value_slope, NULL);
@@ -5945,7 +6305,7 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
         seed_fn(seed_user, at, count, b.value, b.pull, b.seed);
         if (d_code) disti_fold_sum(shape, &b, b.seed, at / DISTI_BLOCK);
     }
-    if (d_code) disti_fold_backward(shape, &b, 0, (size_t)net->code_size, d_code);
+    if (d_code) disti_fold_backward(shape, &own, 0, (size_t)net->code_size, d_code);
 }
 
 #ifndef DIST_NO_BACKWARD
@@ -6078,85 +6438,6 @@ static void disti_wide_eval(const dist_shape *shape, int worker, size_t n, const
     disti_counter_of(shape->ctx, worker)->done += (double)dist_net_operations(net, 1) * (double)n;
 }
 
-/* Rows left out, too. A unit's pre-activation a(p) = b + sum_k w_k x_k(p) over a group of neighboring points is bounded
-   from what the layer's inputs were there: with x_k(p) = A_k + J_k . (p - c) + e_k(p), |e_k| <= E_k, where J_k is
-   whatever seems right and A_k and E_k are then the middle and half the range of x_k - J_k . (p - c) over the group,
-
-     a(p) <= b + sum_k w_k A_k + max_p (sum_k w_k J_k) . (p - c) + sum_k |w_k| E_k
-
-   The bound asks nothing of the layers before, whose outputs are known, so it does not loosen with depth. It costs five
-   columns for the whole group; the maximum is taken over boxes around a dozen points each. A unit for which it is
-   negative is dead over the group and is not computed; rounding, of the sums here and of those left out, each at most
-   2 (K + 4) 2^-24 times the sum of the magnitudes of its K terms, is in E_k. So no bit of any result changes.
-   J of a unit that is alive all over the group is sum_k w_k J_k; of one that changes sign, half of it.
-   The weights of the units that are left are packed for the group, which its four blocks then share. */
-enum {
-    DISTI_GROUP = 4,
-    DISTI_GROUP_POINTS = (int)DISTI_GROUP * DISTI_BLOCK,
-    DISTI_CELL_POINTS = 12,
-    DISTI_CELLS = (int)DISTI_GROUP_POINTS / DISTI_CELL_POINTS,
-    DISTI_SORTED = 8 * (int)DISTI_GROUP_POINTS /* points put in order at once */
-};
-
-typedef struct disti_place { /* a point, and which it is */
-    float p[3];
-    int at;
-} disti_place;
-
-typedef struct disti_group {
-    float *x[2];     /* (GROUP, width, B): a layer's input: rows of the units that are computed, then the point's */
-    float *point, *away; /* (GROUP, 3, B): the points, and from the group's center */
-    float *panels, *bias; /* panel_size, max_rows: packed */
-    float *model;    /* (max_rows, 8): A, J, E of the rows in `list` */
-    float *sum;      /* (5, max_rows): of each output, see disti_bound; its row 0 then has the bound */
-    float *top;      /* max_rows */
-    uint64_t *mask;  /* (GROUP, max_rows) */
-    int *alive;      /* (GROUP, max_rows): rows of x alive in the block */
-    int *unit[2];    /* (max_rows): which unit each row of x is */
-    int *list;       /* (max_rows): which columns of the layer's weights the rows of x are */
-    disti_place *place; /* DISTI_SORTED: points in order */
-    float *points;   /* (GROUP_POINTS, 3), in that order */
-    size_t width, panel_size; /* room for three quarters of all units, of the weights for a third */
-    float cell[6 * DISTI_CELLS], center[3], half[3];
-    int alive_count[DISTI_GROUP];
-    int blocks, columns, cells, count; /* columns: of the last block, up to a multiple of 16; count: of list */
-} disti_group;
-
-/* Returns the bytes needed, as disti_block_layout does; b: the worker's block, whose activations it shares. */
-static size_t disti_group_layout(const dist_net *net, unsigned char *base, const disti_block *b, disti_group *g)
-{
-    size_t at = 0, rows = (size_t)net->max_rows, row = DISTI_BLOCK * sizeof(float);
-    memset(g, 0, sizeof *g);
-    g->width = disti_round_up(rows * 3 / 4, 8);
-    g->panel_size = rows * rows / 3;
-    g->x[0] = b->act[0]; /* and the three after it: they are not used at the same time */
-    g->x[1] = (float *)disti_take(base, &at, DISTI_GROUP * g->width, row);
-    g->unit[0] = (int *)disti_take(base, &at, rows, sizeof(int));
-    g->unit[1] = (int *)disti_take(base, &at, rows, sizeof(int));
-    g->point = (float *)disti_take(base, &at, DISTI_GROUP * 3, row);
-    g->away = (float *)disti_take(base, &at, DISTI_GROUP * 3, row);
-    g->panels = (float *)disti_take(base, &at, g->panel_size, sizeof(float));
-    g->bias = (float *)disti_take(base, &at, rows, sizeof(float));
-    g->model = (float *)disti_take(base, &at, rows * 8, sizeof(float));
-    g->sum = (float *)disti_take(base, &at, rows * 5, sizeof(float));
-    g->top = (float *)disti_take(base, &at, rows, sizeof(float));
-    g->mask = (uint64_t *)disti_take(base, &at, DISTI_GROUP * rows, sizeof(uint64_t));
-    g->alive = (int *)disti_take(base, &at, DISTI_GROUP * rows, sizeof(int));
-    g->list = (int *)disti_take(base, &at, rows, sizeof(int));
-    g->place = (disti_place *)disti_take(base, &at, DISTI_SORTED, sizeof(disti_place));
-    g->points = (float *)disti_take(base, &at, DISTI_GROUP_POINTS * 3, sizeof(float));
-    return at;
-}
-
-/* Whether it is tried: wide nets of units that can be dead and of inputs that are the point itself. */
-static int disti_net_groups(const dist_context *ctx, const dist_net *net)
-{
-    int narrow = net->max_rows;
-    for (int l = 0; l + 1 < net->layers; l++) narrow = DISTI_MIN(narrow, net->layer[l].out);
-    return net->activation == DIST_ACTIVATION_RELU && !net->normed && net->levels == 0 && net->layers > 2 &&
-           narrow >= 96 && net->max_rows <= 1100 && (!ctx->blas.sgemm_fn || narrow < ctx->blas_width);
-}
-
 static void disti_places_init(disti_place *place, const float *points, int n)
 {
     for (int i = 0; i < n; i++) {
@@ -6223,223 +6504,7 @@ static void disti_sort_places(disti_place *place, int begin, int end, int least)
     }
 }
 
-/* Makes the group of n points (n, 3) ready: their rows, idle lanes repeating the last point, and their boxes. */
-static void disti_group_begin(disti_group *g, int n, const float *points)
-{
-    float low[3] = {3e38f, 3e38f, 3e38f}, high[3] = {-3e38f, -3e38f, -3e38f};
-    g->blocks = (n + DISTI_BLOCK - 1) / DISTI_BLOCK;
-    g->columns = (n - (g->blocks - 1) * DISTI_BLOCK + 15) / 16 * 16;
-    g->cells = (n + DISTI_CELL_POINTS - 1) / DISTI_CELL_POINTS;
-    for (int i = 0; i < 3 * n; i++) {
-        low[i % 3] = DISTI_MIN(low[i % 3], points[i]);
-        high[i % 3] = DISTI_MAX(high[i % 3], points[i]);
-    }
-    for (int k = 0; k < 3; k++) {
-        g->center[k] = 0.5f * (low[k] + high[k]);
-        g->half[k] = 0.50001f * (high[k] - low[k]);
-        for (int i = 0; i < g->blocks * DISTI_BLOCK; i++) {
-            size_t at = (size_t)(i / DISTI_BLOCK * 3 + k) * DISTI_BLOCK + (size_t)(i % DISTI_BLOCK);
-            g->point[at] = points[3 * DISTI_MIN(i, n - 1) + k];
-            g->away[at] = g->point[at] - g->center[k];
-        }
-        for (int i = 0; i < g->cells; i++) {
-            float least = 3e38f, most = -3e38f;
-            for (int j = i * DISTI_CELL_POINTS; j < DISTI_MIN((i + 1) * DISTI_CELL_POINTS, n); j++) {
-                float away = points[3 * j + k] - g->center[k];
-                least = DISTI_MIN(least, away);
-                most = DISTI_MAX(most, away);
-            }
-            g->cell[6 * i + k] = 0.5f * (least + most);
-            g->cell[6 * i + 3 + k] = 0.50001f * (most - least);
-        }
-    }
-}
-
-/* One row of the input, as it stands over the group, to the model's next entry: column `column` of the weights.
-   slack: what rounding may add, relative. */
-static void disti_group_model(disti_group *g, int column, const float slope[3], float least, float most, float slack)
-{
-    float *m = g->model + (size_t)g->count * 8, middle = 0.5f * (least + most), reach = 0.0f;
-    g->list[g->count++] = column;
-    m[0] = middle;
-    for (int k = 0; k < 3; k++) {
-        m[1 + k] = slope[k];
-        reach += (slope[k] < 0.0f ? -slope[k] : slope[k]) * g->half[k];
-    }
-    float range = DISTI_MAX(most - middle, middle - least);
-    m[4] = range + slack * (range + reach + (middle < 0.0f ? -middle : middle));
-}
-
-/* Layer l's units that may be alive, to unit: those whose bound is not negative. Returns how many. */
-static int disti_group_units(const dist_shape *shape, const disti_kernels *kernels, disti_group *g, int l, float slack,
-                             int *unit)
-{
-    const dist_net *net = shape->net;
-    const disti_linear *layer = &net->layer[l];
-    const float *bias = shape->bias + (size_t)l * (size_t)net->max_rows;
-    size_t out = (size_t)layer->out, stride = (size_t)net->max_rows;
-    disti_bound bound;
-    int count = 0;
-    bound.weights = net->panels + layer->panel;
-    bound.list = g->list;
-    bound.model = g->model;
-    bound.sum = g->sum;
-    bound.stride = stride;
-    bound.rows = layer->prev + layer->point;
-    bound.count = g->count;
-    bound.out = layer->out;
-    kernels->bound(&bound);
-    kernels->top(out, g->sum, stride, g->cells, g->cell, g->top);
-    for (size_t o = 0; o < out; o++) {
-        float most = g->sum[o] + bias[o] + g->top[o] + g->sum[4 * stride + o] + slack * fabsf(bias[o]);
-        unit[count] = (int)o;
-        count += !(most < 0.0f && disti_finite(most)); /* what is not finite comes out as without */
-    }
-    return count;
-}
-
-/* The weights of those `out` units for the rows in g->list, and their biases. */
-static void disti_group_pack(const dist_shape *shape, disti_group *g, int l, int out, const int *unit)
-{
-    const dist_net *net = shape->net;
-    const disti_linear *layer = &net->layer[l];
-    size_t panel = (size_t)(layer->prev + layer->point) * 8;
-    for (int o = 0; o < out; o += 8) {
-        const float *from[8];
-        float *row = g->panels + (size_t)o * (size_t)g->count;
-        for (int i = 0; i < 8; i++) {
-            size_t u = (size_t)unit[DISTI_MIN(o + i, out - 1)];
-            from[i] = net->panels + layer->panel + u / 8 * panel + u % 8;
-            g->bias[o + i] = shape->bias[(size_t)l * (size_t)net->max_rows + u];
-        }
-        for (int j = 0; j < g->count; j++, row += 8) {
-            const size_t k = (size_t)g->list[j] * 8;
-            row[0] = from[0][k];
-            row[1] = from[1][k];
-            row[2] = from[2][k];
-            row[3] = from[3][k];
-            row[4] = from[4][k];
-            row[5] = from[5][k];
-            row[6] = from[6][k];
-            row[7] = from[7][k];
-        }
-    }
-}
-
-/* Hidden layer l of the group's blocks: x to `out` rows. */
-static void disti_group_layer(const dist_shape *shape, const disti_kernels *kernels, disti_group *g, int l, int out)
-{
-    const dist_net *net = shape->net;
-    size_t width = (size_t)net->max_rows;
-    disti_gemm m;
-    m.weights = g->panels;
-    m.bias = g->bias;
-    m.rows = g->count;
-    m.out = out;
-    m.relu = 1;
-    for (int j = 0; j < g->blocks; j++) {
-        m.x = g->x[l & 1] + (size_t)j * g->width * DISTI_BLOCK;
-        m.y = g->x[(l + 1) & 1] + (size_t)j * g->width * DISTI_BLOCK;
-        m.alive = g->alive + (size_t)j * width;
-        m.alive_count = g->alive_count[j];
-        m.mask = g->mask + (size_t)j * width;
-        m.columns = j + 1 < g->blocks ? (int)DISTI_BLOCK : g->columns;
-        kernels->gemm(&m);
-    }
-}
-
-/* The input rows of layer l: of the `units` computed those that are alive, then the point; their lists, their model. */
-static void disti_group_input(const dist_shape *shape, const disti_kernels *kernels, disti_group *g, int l, int units,
-                              float slack)
-{
-    const dist_net *net = shape->net;
-    const disti_linear *layer = &net->layer[l];
-    size_t width = (size_t)net->max_rows, stride = g->width * DISTI_BLOCK;
-    const int *unit = g->unit[l & 1];
-    float *x = g->x[l & 1];
-    uint64_t full = ((uint64_t)1 << DISTI_BLOCK) - 1;
-    g->count = 0;
-    memset(g->alive_count, 0, sizeof g->alive_count);
-    for (int u = 0; u < units; u++) {
-        uint64_t any = 0, all = full;
-        float slope[3], least, most, *row = x + (size_t)u * DISTI_BLOCK, *to = x + (size_t)g->count * DISTI_BLOCK;
-        for (int j = 0; j < g->blocks; j++) {
-            uint64_t mask = g->mask[(size_t)j * width + (size_t)u];
-            any |= mask;
-            all &= j + 1 < g->blocks ? mask : mask | ~(uint64_t)0 << g->columns;
-        }
-        if (!any) continue;
-        for (size_t k = 0; k < 3; k++)
-            slope[k] = (all == full ? 1.0f : 0.5f) * g->sum[(1 + k) * width + (size_t)unit[u]];
-        kernels->fit(g->blocks, g->columns, row, stride, g->away, slope, &least, &most);
-        for (int j = 0; j < g->blocks; j++) { /* what is alive moves together */
-            size_t at = (size_t)j * width;
-            if (g->mask[at + (size_t)u]) g->alive[at + (size_t)g->alive_count[j]++] = g->count;
-            if (row != to) memcpy(to + (size_t)j * stride, row + (size_t)j * stride, DISTI_BLOCK * sizeof(float));
-        }
-        disti_group_model(g, unit[u], slope, least, most, slack);
-    }
-    for (int j = 0; j < g->blocks; j++) {
-        memcpy(x + (size_t)j * stride + (size_t)g->count * DISTI_BLOCK, g->point + (size_t)j * 3 * DISTI_BLOCK,
-               (size_t)layer->point * DISTI_BLOCK * sizeof(float));
-        for (int i = 0; i < layer->point; i++)
-            g->alive[(size_t)j * width + (size_t)g->alive_count[j]++] = g->count + i;
-    }
-    for (int i = 0; i < layer->point; i++) {
-        float slope[3] = {0, 0, 0};
-        slope[i] = 1.0f;
-        disti_group_model(g, layer->prev + i, slope, g->center[i], g->center[i], slack);
-    }
-}
-
-/* f at a group of points. 0: hardly a unit is dead over all of it: not done. */
-static int disti_group_eval(const dist_shape *shape, int worker, disti_group *g, disti_block *b, int n,
-                            const float *points, float *sdf)
-{
-    const dist_net *net = shape->net;
-    disti_kernels kernels = disti_kernels_for(shape->ctx->isa);
-    disti_counter *counter = disti_counter_of(shape->ctx, worker);
-    int units = 0, last = net->layers - 1;
-    float slack = 5e-7f * (float)(net->max_rows + 16); /* twice 4 (K + 4) 2^-24 */
-    double done = 0.0;
-    size_t width = (size_t)net->max_rows;
-    disti_group_begin(g, n, points);
-    disti_group_input(shape, &kernels, g, 0, 0, slack);
-    for (int l = 0; l < last; l++) {
-        const disti_linear *layer = &net->layer[l];
-        int *unit = g->unit[(l + 1) & 1];
-        units = disti_group_units(shape, &kernels, g, l, slack, unit);
-        size_t most = disti_round_up((size_t)units, 8);
-        if (most + (size_t)net->layer[l + 1].point > g->width || most * (size_t)g->count > g->panel_size) return 0;
-        disti_group_pack(shape, g, l, units, unit);
-        disti_group_layer(shape, &kernels, g, l, units);
-        done += 5.0 * (double)g->count * layer->out;
-        for (int j = 0; j < g->blocks; j++) {
-            int columns = DISTI_MIN(n - j * DISTI_BLOCK, (int)DISTI_BLOCK);
-            done += (double)g->alive_count[j] * (double)units * (double)columns;
-        }
-        disti_group_input(shape, &kernels, g, l + 1, units, slack);
-    }
-    const disti_linear *layer = &net->layer[last];
-    const float *w = net->panels + layer->panel + (size_t)net->sdf_channel * (size_t)(layer->prev + layer->point);
-    for (int j = 0; j < g->count; j++) g->panels[j] = w[g->list[j]];
-    b->kernels = kernels;
-    b->last = g->panels;
-    b->values = 1;
-    for (int j = 0; j < g->blocks; j++) {
-        b->columns = DISTI_MIN(n - j * DISTI_BLOCK, (int)DISTI_BLOCK);
-        b->alive_count[last] = g->alive_count[j];
-        memcpy(b->alive + (size_t)last * width, g->alive + (size_t)j * width, (size_t)g->alive_count[j] * sizeof(int));
-        disti_net_output(shape, b, g->x[last & 1] + (size_t)j * g->width * DISTI_BLOCK, net->sdf_channel);
-        memcpy(sdf + j * DISTI_BLOCK, b->value, (size_t)b->columns * sizeof(float));
-        done += (double)g->alive_count[j] * (double)b->columns;
-    }
-    counter->done += done;
-    counter->dense += (double)dist_net_operations(net, 1) * (double)n;
-    return 1;
-}
-
-/* f at n points, in the order of neighbors: blocks of these share dead units; many, in groups. */
+/* f at n points, in the order of neighbors: blocks of these share dead units. */
 static void disti_groups_eval(void *user, int worker, size_t n, const float *points, float *sdf)
 {
     const dist_shape *shape = (const dist_shape *)user;
@@ -6456,9 +6521,7 @@ static void disti_groups_eval(void *user, int worker, size_t n, const float *poi
             int part = DISTI_MIN(count - first, (int)DISTI_GROUP_POINTS);
             const disti_place *place = g.place + first;
             for (int i = 0; i < part; i++) memcpy(g.points + 3 * i, place[i].p, 3 * sizeof(float));
-            int few = n <= 2 * DISTI_GROUP_POINTS || part <= 2 * DISTI_BLOCK; /* bounds cost more than they save */
-            if (few || !disti_group_eval(shape, worker, &g, &b, part, g.points, value))
-                disti_shape_fused(user, worker, (size_t)part, g.points, value, NULL, NULL, NULL, NULL);
+            disti_shape_fused(user, worker, (size_t)part, g.points, value, NULL, NULL, NULL, NULL);
             for (int i = 0; i < part; i++) sdf[at + (size_t)place[i].at] = value[i];
         }
     }
@@ -6851,26 +6914,30 @@ static void disti_shape_color_weights_fn(void *user, dist_context *ctx, size_t n
 /* Of the low-discrepancy sequence of points: powers of the plastic number of three dimensions, inverted. */
 static const double DISTI_PLASTIC[3] = {0.8191725133961645, 0.6710436067037893, 0.5497004779019703};
 
-/* Whether bounds find enough units dead over groups as a picture has them: tried around some of B points. */
-static int disti_groups_pay(const dist_shape *shape, const float *points)
+/* Whether bounds find enough units dead over blocks as a picture has them: tried around some of B points. */
+static int disti_groups_pay(dist_shape *shape, const float *points)
 {
     const int probes = 4;
     disti_block b;
     disti_group g;
     size_t bytes = disti_block_layout(shape->net, disti_lane(shape->ctx, 0), &b);
-    float sdf[DISTI_GROUP_POINTS];
-    int pay = 0;
+    disti_kernels kernels = disti_kernels_for(shape->ctx->isa);
+    disti_counter *counter = disti_counter_of(shape->ctx, 0), plain = *counter;
+    double some = 0.0;
+    float sdf[DISTI_BLOCK];
     disti_group_layout(shape->net, disti_lane(shape->ctx, 0) + bytes, &b, &g);
+    shape->groups = 0;
     for (int probe = 0; probe < probes; probe++, points += 3 * (int)DISTI_BLOCK / probes) {
-        for (int i = 0; i < DISTI_GROUP_POINTS; i++) {
+        for (int i = 0; i < DISTI_BLOCK; i++) {
             for (int k = 0; k < 3; k++) {
                 double u = DISTI_PLASTIC[k] * (double)(i + 1);
                 g.points[3 * i + k] = points[k] + 0.12f * shape->net->bound * (float)(u - floor(u) - 0.5);
             }
         }
-        pay += disti_group_eval(shape, 0, &g, &b, DISTI_GROUP_POINTS, g.points, sdf);
+        disti_shape_fused(shape, 0, DISTI_BLOCK, g.points, sdf, NULL, NULL, NULL, NULL);
+        some += disti_group_forward(shape, &kernels, &g, DISTI_BLOCK, g.points);
     }
-    return 2 * pay >= probes;
+    return some < 0.8 * (counter->done - plain.done);
 }
 
 /* Sampled |grad f| outside the surface: the 4/5 quantile near it, 31/32 beyond disti_far_from, at least 1. What matters

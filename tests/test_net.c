@@ -406,11 +406,21 @@ TEST(a_dead_unit_that_is_left_out_changes_no_bit)
     }
 }
 
-/* Units that a bound proves dead over a group of neighbors are not computed: the bits are those of any one point. */
+static void unit_seed(void *user, size_t first, size_t n, const float *sdf, const float *gradient, float *seed)
+{
+    (void)user;
+    (void)first;
+    (void)sdf;
+    (void)gradient;
+    for (size_t i = 0; i < n; i++) seed[i] = 1.0f;
+}
+
+/* Units that a bound proves dead over a block of neighbors are not computed: the bits are those of any one point. */
 TEST(rows_that_are_left_out_change_no_bit)
 {
     enum { MANY = 2111 };
-    static float points[3 * MANY], sdf[3][MANY];
+    static float points[3 * MANY], sdf[3][MANY], gradient[2][3 * MANY];
+    static double d_code[2][256];
     for (int from = 0; from < 2; from++) {
         model_desc desc = {.hidden = 5, .width = 131, .skip = 3, .code_size = 2};
         dist_context *ctx = test_context();
@@ -442,6 +452,16 @@ TEST(rows_that_are_left_out_change_no_bit)
             }
             CHECK_BYTES(n * sizeof(float), sdf[1], sdf[0]);
             CHECK_BYTES(n * sizeof(float), sdf[2], sdf[0]);
+            for (int mode = 0; mode < 2; mode++) { /* and with the reverse pass */
+                memset(d_code[mode], 0, sizeof d_code[mode]);
+                shape->groups = mode == 0;
+                field.fused_fn(field.user, 0, n, points, sdf[mode], gradient[mode], unit_seed, NULL, d_code[mode]);
+            }
+            CHECK_BYTES(n * sizeof(float), sdf[1], sdf[0]);
+            CHECK_BYTES(n * sizeof(float), sdf[2], sdf[0]);
+            CHECK_BYTES(3 * n * sizeof(float), gradient[1], gradient[0]);
+            CHECK_BYTES((size_t)dist_net_code_size(net) * sizeof(double), d_code[1], d_code[0]);
+            CHECK(d_code[0][0] != 0);
         }
         CHECK(done[0] < 0.8 * done[1]);
         dist_shape_destroy(shape);

@@ -2737,9 +2737,11 @@ DISTI_GEMM_TILE(tall_avx512, 16, 1, DISTI_ABOVE)
     }
 DISTI_BACK_TILE(few_avx512, 4, 3)
 #define DISTI_ABS(v) _mm512_andnot_ps(_mm512_set1_ps(-0.0f), v)
-#define DISTI_TWO(p, q) _mm512_insertf32x8(_mm512_castps256_ps512(_mm256_loadu_ps(p)), _mm256_loadu_ps(q), 1)
+#define DISTI_TWO(p, q) \
+    _mm512_maskz_insertf32x8((__mmask16)0xffff, _mm512_castps256_ps512(_mm256_loadu_ps(p)), _mm256_loadu_ps(q), 1)
 #define DISTI_TWO_STORE(p, q, v) \
-    _mm256_storeu_ps(p, _mm512_castps512_ps256(v)); _mm256_storeu_ps(q, _mm512_extractf32x8_ps(v, 1));
+    _mm256_storeu_ps(p, _mm512_maskz_extractf32x8_ps((__mmask8)0xff, v, 0)); \
+    _mm256_storeu_ps(q, _mm512_maskz_extractf32x8_ps((__mmask8)0xff, v, 1));
 DISTI_KERNELS(avx512, 8, 3)
 #undef DISTI_ABS
 #undef DISTI_TWO

@@ -1641,6 +1641,17 @@ typedef struct disti_gemm_weights {
     int out, rows, columns;
 } disti_gemm_weights;
 
+/* Few points: y[c][o] = max(0, bias[o] + sum_k weights(o, k) x[c][k]), gemm's bits, over the rows listed in ascending
+   order; most[o] = the largest of y[.][o]. bias, y and most are written or read up to out rounded up to 8. */
+enum { DISTI_FEW_POINTS = 12 };
+typedef struct disti_few {
+    const float *weights, *bias, *x; /* x (points, stride) */
+    const int *list;
+    float *y, *most; /* y (points, stride) */
+    size_t stride;
+    int rows, count, out, points;
+} disti_few;
+
 enum { DISTI_CELL_POINTS = 12, DISTI_CELLS = DISTI_BLOCK / DISTI_CELL_POINTS }; /* neighbors, and their boxes */
 
 /* Of each block, sums over the rows listed, for every output o: sum[0..3][o] = sum_i weights(o, list[i]) model[i][0..3]
@@ -1672,6 +1683,8 @@ typedef struct disti_kernels {
     void (*gemm)(const disti_gemm *g);
     /* gemm's bits of the `count` outputs listed alone, with ReLU and mask, whose other rows become 0 */
     void (*gemm_some)(const disti_gemm *g, const int *list, int count);
+    void (*few)(const disti_few *g);
+    int few_points; /* up to so many points `few` is the faster */
     void (*bound)(const disti_bound *g);
     /* top[o] = sum[0][o] + sum[4][o] + bias[o] + slack |bias[o]| + the largest of sum[1..3][o] . c + |sum[1..3][o]| . h
        over DISTI_CELLS boxes (center c, half extents h) */
@@ -2040,6 +2053,24 @@ static void disti_relu_scalar(size_t rows, float *y, uint64_t *mask)
     }
 }
 
+static void disti_few_scalar(const disti_few *g)
+{
+    for (int o = 0; o < (g->out + 7) / 8 * 8; o++) {
+        const float *w = g->weights + (size_t)(o / 8) * (size_t)g->rows * 8 + o % 8;
+        g->most[o] = 0.0f;
+        for (size_t c = 0; c < (size_t)g->points; c++) {
+            float sum = g->bias[o];
+            for (int i = 0; i < g->count; i++) {
+                const size_t k = (size_t)g->list[i];
+                sum += w[k * 8] * g->x[c * g->stride + k];
+            }
+            sum = sum > 0.0f ? sum : 0.0f;
+            g->y[c * g->stride + (size_t)o] = sum;
+            g->most[o] = DISTI_MAX(g->most[o], sum);
+        }
+    }
+}
+
 static void disti_bound_scalar(const disti_bound *g)
 {
     for (int b = 0; b < g->blocks; b++) {
@@ -2196,10 +2227,12 @@ DISTI_PLAIN(scalar, static)
 #define DISTI_X1(M, i) M(i, 0)
 #define DISTI_X2(M, i) M(i, 0) M(i, 1)
 #define DISTI_X3(M, i) M(i, 0) M(i, 1) M(i, 2)
+#define DISTI_X4(M, i) M(i, 0) M(i, 1) M(i, 2) M(i, 3)
 #define DISTI_Y1(M, V) M(0, V)
 #define DISTI_Y4(M, V) M(0, V) M(1, V) M(2, V) M(3, V)
 #define DISTI_Y8(M, V) DISTI_Y4(M, V) M(4, V) M(5, V) M(6, V) M(7, V)
-#define DISTI_Y16(M, V) DISTI_Y8(M, V) M(8, V) M(9, V) M(10, V) M(11, V) M(12, V) M(13, V) M(14, V) M(15, V)
+#define DISTI_Y12(M, V) DISTI_Y8(M, V) M(8, V) M(9, V) M(10, V) M(11, V)
+#define DISTI_Y16(M, V) DISTI_Y12(M, V) M(12, V) M(13, V) M(14, V) M(15, V)
 
 #define DISTI_ZERO1(i, j) DISTI_VEC a##i##j = DISTI_SET1(0.0f);
 #define DISTI_AGAIN1(i, j) a##i##j = DISTI_LOAD(y + i * DISTI_BLOCK + j * DISTI_LANES);
@@ -2548,6 +2581,47 @@ DISTI_PLAIN(scalar, static)
         }                                                                                                              \
     }
 
+/* P points, V vectors of outputs; a point from g->points on is the last one again. */
+#define DISTI_FEW_X(i, V) const float *x##i = g->x + (size_t)(unsigned)DISTI_MIN(i, g->points - 1) * g->stride;
+#define DISTI_FEW_AT(i, j)                                                                                             \
+    const int p##j = p + j * DISTI_LANES / 8, q##j = p##j + 1;                                                         \
+    const size_t at##j = (size_t)(unsigned)DISTI_MIN(p##j, last) * 8 + (DISTI_LANES == 4 ? j % 2 * 4 : 0);             \
+    const size_t to##j = (size_t)(unsigned)DISTI_MIN(q##j, last) * 8;                                                  \
+    const float *w##j = g->weights + (at##j & ~(size_t)7) * rows + (at##j & 7), *u##j = g->weights + to##j * rows;     \
+    DISTI_VEC m##j = DISTI_SET1(0.0f);
+#define DISTI_FEW_INPUT(i, j) const DISTI_VEC v##j = DISTI_TWO(w##j + row, u##j + row);
+#define DISTI_FEW_MAC(i, j) DISTI_FMA(a##i##j, b, v##j);
+#define DISTI_FEW_ROW(i, V) { const DISTI_VEC b = DISTI_SET1(x##i[k]); DISTI_X##V(DISTI_FEW_MAC, i) }
+#define DISTI_FEW_STORE1(i, j)                                                                                         \
+    a##i##j = DISTI_RELU(DISTI_ADD(a##i##j, DISTI_TWO(g->bias + at##j, g->bias + to##j)));                             \
+    m##j = DISTI_GREATER(m##j, a##i##j);                                                                               \
+    DISTI_TWO_STORE(y + at##j, y + to##j, a##i##j)
+#define DISTI_FEW_STORE(i, V)                                                                                          \
+    {                                                                                                                  \
+        float *y = g->y + (size_t)(unsigned)DISTI_MIN(i, g->points - 1) * g->stride;                                   \
+        DISTI_X##V(DISTI_FEW_STORE1, i)                                                                                \
+    }
+#define DISTI_FEW_MOST(i, j) DISTI_TWO_STORE(g->most + at##j, g->most + to##j, m##j)
+#define DISTI_FEW_TILE(name, P, V)                                                                                     \
+    DISTI_NOINLINE DISTI_FUNCTION void disti_few_##name(const disti_few *g)                                            \
+    {                                                                                                                  \
+        const int last = (g->out + 7) / 8 - 1;                                                                         \
+        const size_t rows = (size_t)(unsigned)g->rows;                                                                 \
+        DISTI_Y##P(DISTI_FEW_X, V)                                                                                     \
+        for (int p = 0; p <= last; p += V * DISTI_LANES / 8) {                                                         \
+            DISTI_X##V(DISTI_FEW_AT, 0)                                                                                \
+            DISTI_Y##P(DISTI_ZERO, V)                                                                                  \
+            for (const int *list = g->list, *end = list + g->count; list < end; list++) {                              \
+                const size_t k = (size_t)(unsigned)*list, row = k * 8;                                                 \
+                DISTI_X##V(DISTI_FEW_INPUT, 0)                                                                         \
+                DISTI_Y##P(DISTI_FEW_ROW, V)                                                                           \
+                DISTI_FENCE                                                                                            \
+            }                                                                                                          \
+            DISTI_Y##P(DISTI_FEW_STORE, V)                                                                             \
+            DISTI_X##V(DISTI_FEW_MOST, 0)                                                                              \
+        }                                                                                                              \
+    }
+
 /* Two vectors of outputs at a time: of one panel, of two, of four. */
 #define DISTI_BOUND1(j)                                                                                                \
     { const DISTI_VEC b = DISTI_SET1(m[j]); DISTI_FMA(a0##j, b, v); DISTI_FMA(a1##j, b, w); }
@@ -2643,11 +2717,14 @@ DISTI_FUNCTION __m128 disti_keep_sse2(__m128 v, int bits)
 #define DISTI_TALL(isa)
 #define DISTI_FEW(isa)
 #define DISTI_DEPTH 112
+#define DISTI_GREATER(a, b) _mm_max_ps(a, b)
 #define DISTI_ABS(v) _mm_andnot_ps(_mm_set1_ps(-0.0f), v)
 #define DISTI_TWO(p, q) ((void)(q), DISTI_LOAD(p))
 #define DISTI_TWO_STORE(p, q, v) (void)(q); DISTI_STORE(p, v);
 DISTI_KERNELS(sse2, 4, 2)
+DISTI_FEW_TILE(four_sse2, 4, 2)
 #undef DISTI_ABS
+#undef DISTI_GREATER
 #undef DISTI_FUNCTION
 #undef DISTI_VEC
 #undef DISTI_LANES
@@ -2685,9 +2762,12 @@ DISTI_FUNCTION __m256 disti_keep_avx2(__m256 v, int bits)
     return _mm256_and_ps(v, _mm256_castsi256_ps(_mm256_cmpeq_epi32(both, lane)));
 }
 #define DISTI_DEPTH 176
+#define DISTI_GREATER(a, b) _mm256_max_ps(a, b)
 #define DISTI_ABS(v) _mm256_andnot_ps(_mm256_set1_ps(-0.0f), v)
 DISTI_KERNELS(avx2, 4, 3)
+DISTI_FEW_TILE(four_avx2, 4, 2)
 #undef DISTI_ABS
+#undef DISTI_GREATER
 #undef DISTI_TWO
 #undef DISTI_TWO_STORE
 #undef DISTI_TALL
@@ -2736,6 +2816,7 @@ DISTI_GEMM_TILE(tall_avx512, 16, 1, DISTI_ABOVE)
         continue;                                                                                                      \
     }
 DISTI_BACK_TILE(few_avx512, 4, 3)
+#define DISTI_GREATER(a, b) _mm512_maskz_max_ps((__mmask16)0xffff, a, b)
 #define DISTI_ABS(v) _mm512_andnot_ps(_mm512_set1_ps(-0.0f), v)
 #define DISTI_TWO(p, q) \
     _mm512_maskz_insertf32x8((__mmask16)0xffff, _mm512_castps256_ps512(_mm256_loadu_ps(p)), _mm256_loadu_ps(q), 1)
@@ -2743,7 +2824,17 @@ DISTI_BACK_TILE(few_avx512, 4, 3)
     _mm256_storeu_ps(p, _mm512_maskz_extractf32x8_ps((__mmask8)0xff, v, 0)); \
     _mm256_storeu_ps(q, _mm512_maskz_extractf32x8_ps((__mmask8)0xff, v, 1));
 DISTI_KERNELS(avx512, 8, 3)
+DISTI_FEW_TILE(four_avx512, 4, 4)
+DISTI_FEW_TILE(eight_avx512, 8, 2)
+DISTI_FEW_TILE(twelve_avx512, 12, 2)
+static void disti_few_avx512(const disti_few *g)
+{
+    if (g->points <= 4) disti_few_four_avx512(g);
+    else if (g->points <= 8) disti_few_eight_avx512(g);
+    else disti_few_twelve_avx512(g);
+}
 #undef DISTI_ABS
+#undef DISTI_GREATER
 #undef DISTI_TWO
 #undef DISTI_TWO_STORE
 #undef DISTI_TALL
@@ -3033,11 +3124,14 @@ static float32x4_t disti_keep_neon(float32x4_t v, uint32_t bits)
 #define DISTI_TALL(isa)
 #define DISTI_FEW(isa)
 #define DISTI_DEPTH 112
+#define DISTI_GREATER(a, b) vmaxq_f32(a, b)
 #define DISTI_ABS(v) vabsq_f32(v)
 #define DISTI_TWO(p, q) ((void)(q), DISTI_LOAD(p))
 #define DISTI_TWO_STORE(p, q, v) (void)(q); DISTI_STORE(p, v);
 DISTI_KERNELS(neon, 8, 3)
+DISTI_FEW_TILE(four_neon, 4, 2)
 #undef DISTI_ABS
+#undef DISTI_GREATER
 #undef DISTI_TWO
 #undef DISTI_TWO_STORE
 #endif
@@ -3080,15 +3174,17 @@ static disti_kernels disti_kernels_for(int isa)
 {
     disti_kernels kernels;
     DISTI_TABLE(scalar)
+    kernels.few = disti_few_scalar;
+    kernels.few_points = DISTI_FEW_POINTS;
 #ifdef DISTI_X86
-    if (isa == DIST_ISA_SSE2) { DISTI_TABLE(sse2) }
-    if (isa == DIST_ISA_AVX2) { DISTI_TABLE(avx2) }
-    if (isa == DIST_ISA_AVX512) { DISTI_TABLE(avx512) }
+    if (isa == DIST_ISA_SSE2) { DISTI_TABLE(sse2) kernels.few = disti_few_four_sse2; }
+    if (isa == DIST_ISA_AVX2) { DISTI_TABLE(avx2) kernels.few = disti_few_four_avx2; }
+    if (isa == DIST_ISA_AVX512) { DISTI_TABLE(avx512) kernels.few = disti_few_avx512; }
 #endif
 #ifdef DISTI_NEON
-    if (isa == DIST_ISA_NEON) { DISTI_TABLE(neon) }
+    if (isa == DIST_ISA_NEON) { DISTI_TABLE(neon) kernels.few = disti_few_four_neon; }
 #endif
-    (void)isa;
+    if (isa > DIST_ISA_SCALAR && isa != DIST_ISA_AVX512) kernels.few_points = 4;
     return kernels;
 }
 
@@ -3096,9 +3192,11 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_X1
 #undef DISTI_X2
 #undef DISTI_X3
+#undef DISTI_X4
 #undef DISTI_Y1
 #undef DISTI_Y4
 #undef DISTI_Y8
+#undef DISTI_Y12
 #undef DISTI_Y16
 #undef DISTI_ZERO1
 #undef DISTI_AGAIN1
@@ -3146,6 +3244,15 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_SOME_STORE1
 #undef DISTI_SOME_STORE
 #undef DISTI_SOME_TILE
+#undef DISTI_FEW_X
+#undef DISTI_FEW_AT
+#undef DISTI_FEW_INPUT
+#undef DISTI_FEW_MAC
+#undef DISTI_FEW_ROW
+#undef DISTI_FEW_STORE1
+#undef DISTI_FEW_STORE
+#undef DISTI_FEW_MOST
+#undef DISTI_FEW_TILE
 #undef DISTI_BOUND
 #undef DISTI_BOUND1
 #undef DISTI_BOUND_ZERO
@@ -6034,6 +6141,64 @@ static void disti_fold_sum(const dist_shape *shape, disti_block *b, const float 
     if (index % 16 == 15) disti_fold_flush(net, b);
 }
 
+/* Whether few points go through kernels.few. */
+static int disti_net_few(const dist_shape *shape, const disti_block *b, size_t n)
+{
+    const dist_net *net = shape->net;
+    return b->values && n <= (size_t)b->kernels.few_points && net->activation == DIST_ACTIVATION_RELU && !net->normed &&
+           net->layers > 1 && !shape->ctx->blas.sgemm_fn;
+}
+
+/* disti_net_forward of a few points: activations stand (points, max_rows), so that weights fill the vectors. The last
+   layer's input is put into rows, of which alive ones are written. */
+static const float *disti_few_forward(const dist_shape *shape, disti_block *b, disti_counter *counter)
+{
+    const dist_net *net = shape->net;
+    size_t width = (size_t)net->max_rows, points = (size_t)b->columns;
+    int last = net->layers - 1;
+    float *most = b->delta[0];
+    double done = 0.0;
+    for (int l = 0; l <= last; l++) {
+        const disti_linear *layer = &net->layer[l];
+        float *x = b->act[l & 1];
+        int *list = b->alive + (size_t)l * width, count = 0;
+        for (int u = 0; u < layer->prev; u++) {
+            list[count] = u;
+            count += most[u] > 0.0f;
+        }
+        for (int i = 0; i < layer->point; i++, count++) {
+            list[count] = layer->prev + i;
+            for (size_t c = 0; c < points; c++) x[c * width + (size_t)list[count]] = b->point[i * DISTI_BLOCK + (int)c];
+        }
+        b->alive_count[l] = count;
+        done += (double)count * layer->out;
+        if (l == last) break;
+        disti_few few;
+        few.weights = net->panels + layer->panel;
+        few.bias = shape->bias + (size_t)l * width;
+        few.x = x;
+        few.list = list;
+        few.y = b->act[(l + 1) & 1];
+        few.most = most;
+        few.stride = width;
+        few.rows = layer->prev + layer->point;
+        few.count = count;
+        few.out = layer->out;
+        few.points = b->columns;
+        b->kernels.few(&few);
+    }
+    counter->done += done * b->columns;
+    const float *x = b->act[last & 1];
+    const int *list = b->alive + (size_t)last * width;
+    float *rows = b->act[(last & 1) ^ 1];
+    for (int i = 0; i < b->alive_count[last]; i++) {
+        float *row = rows + (size_t)list[i] * DISTI_BLOCK;
+        for (size_t c = 0; c < points; c++) row[c] = x[c * width + (size_t)list[i]];
+        for (size_t c = points; c < DISTI_BLOCK; c++) row[c] = 0.0f;
+    }
+    return rows;
+}
+
 /* Rows left out, too. A unit's pre-activation a(p) = b + sum_k w_k x_k(p) over a block of neighboring points is bounded
    from what the layer's inputs were there: with x_k(p) = A_k + J_k . (p - c) + e_k(p), |e_k| <= E_k, where J_k is
    whatever seems right and A_k and E_k are then the middle and half the range of x_k - J_k . (p - c) over the block,
@@ -6295,7 +6460,8 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
             disti_group_block(net, &g, j, &b);
         } else {
             disti_block_load(shape, &b, count, points + 3 * at);
-            const float *x = disti_net_forward(shape, &b, NULL, counter);
+            const float *x = disti_net_few(shape, &b, count) ? disti_few_forward(shape, &b, counter)
+                                                             : disti_net_forward(shape, &b, NULL, counter);
             disti_net_output(shape, &b, x, net->sdf_channel);
         }
         if (sdf) memcpy(sdf + at, b.value, count * sizeof(float));

@@ -406,6 +406,38 @@ TEST(a_dead_unit_that_is_left_out_changes_no_bit)
     }
 }
 
+/* Few points go through kernels of their own: the bits are those of a full block. */
+TEST(a_few_points_have_the_bits_of_many)
+{
+    enum { MANY = 48 };
+    const model_desc descs[] = {{.hidden = 4, .width = 131, .skip = 2, .code_size = 3},
+                                {.hidden = 2, .width = 20},
+                                {.hidden = 3, .width = 33, .fourier = 1, .levels = 3},
+                                {.hidden = 1, .width = 9}};
+    for (int i = 0; i < (int)(sizeof descs / sizeof descs[0]); i++) {
+        dist_context *ctx = test_context();
+        model m = model_make(&descs[i], 11);
+        dist_net *net = model_load(ctx, &m);
+        dist_shape *shape = dist_shape_create(ctx, net, NULL);
+        REQUIRE(shape != NULL);
+        dist_field field = dist_shape_field(shape);
+        float points[3 * MANY], many[MANY], few[MANY];
+        test_random random = test_random_seed(7);
+        test_random_fill(&random, 3 * MANY, points, -0.9f, 0.9f);
+        field.eval_fn(field.user, 0, MANY, points, many, NULL);
+        for (int n = 1; n <= 17; n++) {
+            for (int at = 0; at + n <= MANY; at += n) {
+                field.eval_fn(field.user, 0, (size_t)n, points + 3 * at, few, NULL);
+                CHECK_BYTES((size_t)n * sizeof(float), many + at, few);
+            }
+        }
+        dist_shape_destroy(shape);
+        dist_net_destroy(net);
+        model_free(&m);
+        dist_context_destroy(ctx);
+    }
+}
+
 static void unit_seed(void *user, size_t first, size_t n, const float *sdf, const float *gradient, float *seed)
 {
     (void)user;
@@ -1248,6 +1280,7 @@ int main(int argc, char **argv)
     RUN(a_point_has_the_same_bits_in_every_batch);
     RUN(points_put_in_order_are_all_there_and_neighbors_stand_together);
     RUN(a_dead_unit_that_is_left_out_changes_no_bit);
+    RUN(a_few_points_have_the_bits_of_many);
     RUN(rows_that_are_left_out_change_no_bit);
     RUN(a_saved_net_loads_and_saves_to_the_same_bytes_and_values);
     RUN(saving_into_too_small_a_buffer_is_refused);

@@ -114,7 +114,8 @@ typedef struct dist_scheduler {
 
 /* Matrix product of the user's BLAS: C (m, n) = alpha op(A) op(B) + beta C, all row-major, op(X) = X or its transpose;
    lda, ldb, ldc are row strides in floats. Tried on a small product when the context is made; a wrong answer is
-   refused. May be called from several workers at once. For layers at least dist_context_desc.blas_width wide. */
+   refused. May be called from several workers at once. For layers at least dist_context_desc.blas_width wide, of nets
+   that a context with a BLAS has loaded: others' units may stand in another order. */
 typedef struct dist_blas {
     void *user;
     void (*sgemm_fn)(void *user, int transpose_a, int transpose_b, int m, int n, int k, float alpha, const float *a,
@@ -5507,6 +5508,7 @@ struct dist_net {
     int fold_count; /* layers that see the code */
     disti_linear layer[DISTI_MAX_LAYERS];
     float *params, *panels, *codes;
+    int *unit_order; /* (layers, max_rows): the file's units as they stand in the kernels; NULL: as in the file */
     float *half_panels; /* 32 bits each: two 16-bit weights; NULL: none */
     int half;           /* DIST_HALF_F16 or BF16, or 0 */
     size_t param_count, panel_count, half_count;
@@ -5521,7 +5523,7 @@ struct dist_shape {
     float lipschitz, lipschitz_far;
     float half_error; /* largest of 16 bits at the samples of disti_shape_slope */
     int half;         /* what the net had then */
-    int groups;          /* disti_net_groups */
+    int groups;       /* disti_groups_pay */
     uint32_t all_alive; /* bit l: the samples of disti_shape_slope met no dead unit at layer l's input */
     dist_shape *texture; /* the net that colors it, with [code, color code] folded in; NULL: none */
     size_t store_block_size; /* of activations and deltas, for weight gradients; ctx->store holds store_blocks */
@@ -5738,13 +5740,43 @@ static int disti_use_blas(const dist_shape *shape, int l)
 {
     const disti_linear *layer = &shape->net->layer[l];
     int width = shape->ctx->blas_width;
-    return shape->ctx->blas.sgemm_fn != NULL && layer->out >= width && layer->prev >= width;
+    return shape->ctx->blas.sgemm_fn && !shape->net->unit_order && layer->out >= width && layer->prev >= width;
 }
 
-static void disti_transpose(size_t rows, size_t stride, float scale, const float *x, float *xt)
+static int disti_net_narrowest(const dist_net *net)
 {
-    for (size_t k = 0; k < rows; k++)
-        for (size_t c = 0; c < DISTI_BLOCK; c++) xt[c * stride + k] = scale * x[k * DISTI_BLOCK + c];
+    int narrow = net->max_rows;
+    for (int l = 0; l + 1 < net->layers; l++) narrow = DISTI_MIN(narrow, net->layer[l].out);
+    return narrow;
+}
+
+/* Wide nets of units that can be dead and of inputs that are the point itself. */
+static int disti_net_sparse(const dist_net *net)
+{
+    return net->activation == DIST_ACTIVATION_RELU && !net->normed && net->levels == 0 && net->layers > 2 &&
+           net->max_rows <= 1100 && disti_net_narrowest(net) >= 96;
+}
+
+/* The file's number of unit u of layer l, and of a row of its input. */
+static size_t disti_unit(const dist_net *net, int l, size_t u)
+{
+    return net->unit_order ? (size_t)net->unit_order[(size_t)l * (size_t)net->max_rows + u] : u;
+}
+
+static size_t disti_row(const dist_net *net, int l, size_t k)
+{
+    return k < (size_t)net->layer[l].prev ? disti_unit(net, l - 1, k) : k;
+}
+
+/* Layer l's input x to (B, stride), the file's units side by side. */
+static void disti_transpose(const dist_net *net, int l, const float *x, float *xt)
+{
+    const disti_linear *layer = &net->layer[l];
+    size_t stride = disti_store_stride(layer), rows = (size_t)(layer->prev + layer->point);
+    for (size_t k = 0; k < rows; k++) {
+        float *to = xt + disti_row(net, l, k);
+        for (size_t c = 0; c < DISTI_BLOCK; c++) to[c * stride] = layer->scale * x[k * DISTI_BLOCK + c];
+    }
 }
 
 /* phi'' of a value v = phi(x) whose slope phi'(x) is d. */
@@ -5844,10 +5876,8 @@ static const float *disti_net_forward(const dist_shape *shape, disti_block *b, f
     disti_list_alive(shape, b, 0);
     for (int l = 0; l < net->layers; l++) {
         const disti_linear *layer = &net->layer[l];
-        size_t rows = (size_t)(layer->prev + layer->point);
         if (store)
-            disti_transpose(rows, disti_store_stride(layer), layer->scale, x,
-                            store + disti_store_offset(net, l, DISTI_STORE_INPUT));
+            disti_transpose(net, l, x, store + disti_store_offset(net, l, DISTI_STORE_INPUT));
         done += (double)b->alive_count[l] * layer->out;
         if (l + 1 == net->layers) break;
         disti_hidden(shape, &b->kernels, b, l, x, b->act[l & 1]);
@@ -5994,8 +6024,9 @@ static void disti_keep_delta(const dist_net *net, const disti_block *b, int l, c
     const uint64_t *mask = b->mask + (size_t)(l + 1) * (size_t)net->max_rows;
     int sparse = net->activation == DIST_ACTIVATION_RELU && !net->normed;
     for (size_t u = 0; u < (size_t)net->layer[l].out; u++) {
-        if (sparse && !mask[u]) memset(to + u * DISTI_BLOCK, 0, DISTI_BLOCK * sizeof(float));
-        else memcpy(to + u * DISTI_BLOCK, delta + u * DISTI_BLOCK, DISTI_BLOCK * sizeof(float));
+        float *row = to + disti_unit(net, l, u) * DISTI_BLOCK;
+        if (sparse && !mask[u]) memset(row, 0, DISTI_BLOCK * sizeof(float));
+        else memcpy(row, delta + u * DISTI_BLOCK, DISTI_BLOCK * sizeof(float));
     }
 }
 
@@ -6113,7 +6144,8 @@ static void disti_fold_backward(const dist_shape *shape, disti_block *b, size_t 
         size_t out = (size_t)(l + 1 == net->layers ? b->channels : layer->out);
         size_t row = l + 1 == net->layers ? (size_t)b->channel : 0;
         for (size_t o = 0; o < out; o++) {
-            const float *w = net->params + layer->weight + (o + row) * (size_t)layer->in + layer->code_column;
+            size_t unit = l + 1 == net->layers ? o + row : disti_unit(net, l, o);
+            const float *w = net->params + layer->weight + unit * (size_t)layer->in + layer->code_column;
             double s = sum[o] * (double)layer->scale;
             if (s != 0.0) b->kernels.axpy(count, s, w + first, d_code);
         }
@@ -6268,10 +6300,8 @@ static size_t disti_group_layout(const dist_net *net, unsigned char *base, const
 /* Whether it is tried: wide nets of units that can be dead and of inputs that are the point itself. */
 static int disti_net_groups(const dist_context *ctx, const dist_net *net)
 {
-    int narrow = net->max_rows;
-    for (int l = 0; l + 1 < net->layers; l++) narrow = DISTI_MIN(narrow, net->layer[l].out);
-    return net->activation == DIST_ACTIVATION_RELU && !net->normed && net->levels == 0 && net->layers > 2 &&
-           narrow >= 96 && net->max_rows <= 1100 && (!ctx->blas.sgemm_fn || narrow < ctx->blas_width);
+    int blas = ctx->blas.sgemm_fn && !net->unit_order && disti_net_narrowest(net) >= ctx->blas_width;
+    return disti_net_sparse(net) && !blas;
 }
 
 /* Makes the group of n points (n, 3) ready: their rows, idle lanes repeating the last point, and their boxes. */
@@ -6444,7 +6474,7 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
     if (d_code) disti_fold_begin(net, &own);
     for (size_t at = 0; at < n; at += DISTI_BLOCK, j++) {
         size_t count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK);
-        if (j == blocks && shape->groups && n - at >= DISTI_GROUP_LEAST) {
+        if (j == blocks && shape->groups > own.values && n - at >= DISTI_GROUP_LEAST) {
             int part = (int)DISTI_MIN(n - at, (size_t)DISTI_GROUP_POINTS);
             counter->done += disti_group_forward(shape, &own.kernels, &g, part, points + 3 * at);
             blocks = g.blocks;
@@ -6544,7 +6574,7 @@ static size_t disti_wide_floats(const dist_context *ctx, const dist_net *net)
 {
     for (int l = 1; l + 1 < net->layers; l++)
         if (DISTI_MIN(net->layer[l].out, net->layer[l].prev) < ctx->blas_width) return 0;
-    if (!ctx->blas.sgemm_fn || net->normed || net->layers < 3) return 0;
+    if (!ctx->blas.sgemm_fn || net->unit_order || net->normed || net->layers < 3) return 0;
     return (size_t)(2 * net->max_rows + net->point_size) * DISTI_WIDE_COLUMNS;
 }
 
@@ -6699,7 +6729,7 @@ static void disti_shape_eval_fn(void *user, int worker, size_t n, const float *p
 {
     const dist_shape *shape = (const dist_shape *)user;
     if (!gradient && disti_wide_floats(shape->ctx, shape->net) > 0) disti_wide_eval(shape, worker, n, points, sdf);
-    else if (!gradient && shape->groups && n > DISTI_BLOCK) disti_groups_eval(user, worker, n, points, sdf);
+    else if (!gradient && shape->groups > 1 && n > DISTI_BLOCK) disti_groups_eval(user, worker, n, points, sdf);
     else disti_shape_fused(user, worker, n, points, sdf, gradient, NULL, NULL, NULL);
 }
 
@@ -7082,9 +7112,9 @@ static void disti_shape_color_weights_fn(void *user, dist_context *ctx, size_t n
 /* Of the low-discrepancy sequence of points: powers of the plastic number of three dimensions, inverted. */
 static const double DISTI_PLASTIC[3] = {0.8191725133961645, 0.6710436067037893, 0.5497004779019703};
 
-/* Whether bounds find enough units dead over blocks as a picture has them: tried around some of B points. Beside its
-   multiply-adds a bound costs half of them again, a unit's 256 more and the model of one that is alive 1800, as measured
-   with AVX-512. */
+/* Whether bounds find enough units dead: 0 no; 1 over blocks as close to each other as those of a reverse pass; 2 as a
+   picture has them, too. Tried around some of B points. Beside its multiply-adds a bound costs half of them again, a
+   unit's 256 more and the model of one that is alive 1800, as measured with AVX-512. */
 static int disti_groups_pay(dist_shape *shape, const float *points)
 {
     const int probes = 4;
@@ -7111,7 +7141,8 @@ static int disti_groups_pay(dist_shape *shape, const float *points)
             some += out * (2.5 * g.alive_count[0][l] + 256.0) + 1800.0 * g.alive_units[0][l + 1];
         }
     }
-    return some < 0.9 * (counter->done - plain.done);
+    double share = some / (counter->done - plain.done);
+    return (share < 0.9) + (share < 1.15);
 }
 
 /* Sampled |grad f| outside the surface: the 4/5 quantile near it, 31/32 beyond disti_far_from, at least 1. What matters
@@ -7224,26 +7255,28 @@ DIST_API dist_field dist_shape_field(dist_shape *shape)
     field.clamp = net->clamp;
     field.cost = (float)dist_net_operations(net, 1);
     field.kinks = net->activation == DIST_ACTIVATION_RELU;
-    field.many = shape->groups;
+    field.many = disti_net_groups(shape->ctx, net); /* neighbors share dead units */
     field.code_size = net->code_size;
     return field;
 }
 
-/* Folding: bias'[o] = bias[o] + scale sum_j W_code[o][j] code[j], in double; exact but for one rounding. */
-static void disti_shape_fold(dist_shape *shape)
+/* Folding: bias'[o] = bias[o] + scale sum_j W_code[o][j] code[j], in double; exact but for one rounding. code NULL:
+   zeros. bias (layers, max_rows). */
+static void disti_net_fold(const dist_net *net, const float *code, float *bias)
 {
-    const dist_net *net = shape->net;
-    for (int l = 0; l < net->layers; l++) {
+    for (int l = 0; l < net->layers; l++, bias += net->max_rows) {
         const disti_linear *layer = &net->layer[l];
-        float *bias = shape->bias + (size_t)l * (size_t)net->max_rows;
         for (size_t o = 0; o < (size_t)layer->out; o++) {
-            const float *w = net->params + layer->weight + o * (size_t)layer->in + layer->code_column;
+            size_t unit = l + 1 < net->layers ? disti_unit(net, l, o) : o;
+            const float *w = net->params + layer->weight + unit * (size_t)layer->in + layer->code_column;
             double sum = 0.0;
-            for (size_t j = 0; j < (size_t)layer->code; j++) sum += (double)w[j] * (double)shape->code[j];
-            bias[o] = (float)((double)net->params[layer->bias + o] + (double)layer->scale * sum);
+            for (size_t j = 0; code && j < (size_t)layer->code; j++) sum += (double)w[j] * (double)code[j];
+            bias[o] = (float)((double)net->params[layer->bias + unit] + (double)layer->scale * sum);
         }
     }
 }
+
+static void disti_shape_fold(dist_shape *shape) { disti_net_fold(shape->net, shape->code, shape->bias); }
 
 /* Copies n numbers of a code, zeros for NULL; refuses what is not finite. */
 static dist_status disti_code_copy(dist_context *ctx, const char *function, size_t n, const float *code, float *to)
@@ -7446,6 +7479,8 @@ DIST_API void dist_net_destroy(dist_net *net)
     if (net->params) allocator.free_fn(allocator.user, net->params, net->param_count * sizeof(float));
     if (net->panels) allocator.free_fn(allocator.user, net->panels, net->panel_count * sizeof(float));
     if (net->half_panels) allocator.free_fn(allocator.user, net->half_panels, net->half_count * sizeof(float));
+    if (net->unit_order)
+        allocator.free_fn(allocator.user, net->unit_order, (size_t)net->layers * (size_t)net->max_rows * sizeof(int));
     if (net->codes)
         allocator.free_fn(allocator.user, net->codes, (size_t)net->code_count * (size_t)net->code_size * sizeof(float));
     allocator.free_fn(allocator.user, net, sizeof *net);
@@ -7569,9 +7604,9 @@ static void disti_net_pack(dist_net *net)
         size_t rows = (size_t)(layer->prev + layer->point);
         int last = l + 1 == net->layers;
         for (size_t o = 0; o < (size_t)layer->out; o++) {
-            const float *w = net->params + layer->weight + o * (size_t)layer->in;
+            const float *w = net->params + layer->weight + (last ? o : disti_unit(net, l, o)) * (size_t)layer->in;
             for (size_t k = 0; k < rows; k++) {
-                size_t column = k < (size_t)layer->prev ? (size_t)layer->x_column + k
+                size_t column = k < (size_t)layer->prev ? (size_t)layer->x_column + disti_row(net, l, k)
                                                         : (size_t)layer->point_column + k - (size_t)layer->prev;
                 size_t at = last ? o * rows + k : (o / 8 * rows + k) * 8 + o % 8;
                 net->panels[layer->panel + at] = layer->scale * w[column];
@@ -7580,6 +7615,72 @@ static void disti_net_pack(dist_net *net)
     }
     if (net->half == DIST_HALF_F16 && disti_half_largest(net) > 65504.0f) net->half = DIST_HALF_OFF;
     if (net->half) disti_half_pack(net);
+}
+
+/* params to panels, each layer's units in the order of how often they are alive at points of the bounding sphere, for up to three of
+   the net's codes: what is left out, or put into pairs of 16 bits, then stands side by side in memory. */
+static void disti_net_sort(const dist_context *ctx, dist_net *net)
+{
+    enum { CODES = 3, ROUNDS = 3 };
+    int units = net->unit_order ? net->layers * net->max_rows : 0;
+    for (int i = 0; i < units; i++) net->unit_order[i] = i % net->max_rows;
+    disti_net_pack(net);
+    if (!net->unit_order) return;
+    size_t width = (size_t)net->max_rows, all = (size_t)net->layers * width, at = 0;
+    unsigned char *base = disti_scratch(ctx, 0) + DISTI_COUNTER_BYTES;
+    float *x[2], *bias = (float *)disti_take(base, &at, all, sizeof(float));
+    for (int i = 0; i < 2; i++) x[i] = (float *)disti_take(base, &at, width, DISTI_BLOCK * sizeof(float));
+    uint64_t *mask = (uint64_t *)disti_take(base, &at, width, sizeof(uint64_t));
+    int *count = (int *)disti_take(base, &at, all, sizeof(int)), codes = DISTI_MIN((int)CODES, net->code_count);
+    disti_kernels kernels = disti_kernels_for(ctx->isa);
+    unsigned state = disti_float_state_enter();
+    double u[3] = {0.5, 0.5, 0.5};
+    memset(count, 0, all * sizeof(int));
+    for (int round = 0; round < ROUNDS * DISTI_MAX(codes, 1); round++) {
+        int code = codes > 1 ? round / ROUNDS * (net->code_count - 1) / (codes - 1) : 0;
+        float points[3 * DISTI_BLOCK], point[3 * DISTI_BLOCK];
+        if (round % ROUNDS == 0) disti_net_fold(net, codes ? net->codes + code * net->code_size : NULL, bias);
+        for (int j = 0; j < DISTI_BLOCK;) {
+            double square = 0.0;
+            for (int k = 0; k < 3; k++) {
+                u[k] += DISTI_PLASTIC[k];
+                if (u[k] >= 1.0) u[k] -= 1.0;
+                points[3 * j + k] = net->bound * (float)(2.0 * u[k] - 1.0);
+                square += (2.0 * u[k] - 1.0) * (2.0 * u[k] - 1.0);
+            }
+            j += square <= 1.0;
+        }
+        kernels.rows(points, point);
+        for (int l = 0; l + 1 < net->layers; l++) {
+            const disti_linear *layer = &net->layer[l];
+            disti_gemm g;
+            memcpy(x[l & 1] + (size_t)layer->prev * DISTI_BLOCK, point,
+                   (size_t)layer->point * DISTI_BLOCK * sizeof(float));
+            g.weights = net->panels + layer->panel;
+            g.bias = bias + (size_t)l * width;
+            g.x = x[l & 1];
+            g.y = x[(l + 1) & 1];
+            g.alive = NULL;
+            g.alive_count = 0;
+            g.mask = mask;
+            g.rows = layer->prev + layer->point;
+            g.out = layer->out;
+            g.columns = DISTI_BLOCK;
+            g.relu = 1;
+            kernels.gemm(&g);
+            for (size_t o = 0; o < (size_t)layer->out; o++)
+                for (uint64_t m = mask[o]; m; m &= m - 1) count[(size_t)l * width + o]++;
+        }
+    }
+    disti_float_state_leave(state);
+    for (int l = 0; l + 1 < net->layers; l++) {
+        int *order = net->unit_order + (size_t)l * width, place = 0;
+        const int *alive = count + (size_t)l * width;
+        for (int often = ROUNDS * CODES * DISTI_BLOCK; often >= 0; often--)
+            for (int o = 0; o < net->layer[l].out; o++)
+                if (alive[o] == often) order[place++] = o;
+    }
+    disti_net_pack(net);
 }
 
 DIST_API dist_status dist_net_set_half(dist_context *ctx, dist_net *net, int kind)
@@ -7930,7 +8031,11 @@ static dist_status disti_loader_arrange(disti_loader *loader)
     if (disti_loader_meta(loader) != DIST_OK || disti_loader_shapes(loader) != DIST_OK ||
         disti_loader_codes(loader) != DIST_OK)
         return loader->status;
-    return disti_net_arrange(loader->ctx, loader->net, loader->function, loader->skip, loader->skip_scale);
+    dist_net *net = loader->net;
+    dist_status status = disti_net_arrange(loader->ctx, net, loader->function, loader->skip, loader->skip_scale);
+    if (status != DIST_OK || !disti_net_sparse(net) || loader->ctx->blas.sgemm_fn) return status;
+    net->unit_order = (int *)disti_alloc_array(loader->ctx, (size_t)net->layers * (size_t)net->max_rows, sizeof(int));
+    return net->unit_order ? DIST_OK : DIST_OUT_OF_MEMORY;
 }
 
 DIST_API dist_net *dist_net_load(dist_context *ctx, const void *bytes, size_t size)
@@ -7940,7 +8045,7 @@ DIST_API dist_net *dist_net_load(dist_context *ctx, const void *bytes, size_t si
     if (disti_loader_open(&loader, ctx, bytes, size) != DIST_OK) return NULL;
     loader.net = disti_net_new(ctx);
     int good = loader.net && disti_loader_arrange(&loader) == DIST_OK && disti_loader_values(&loader) == DIST_OK;
-    if (good) disti_net_pack(loader.net);
+    if (good) disti_net_sort(ctx, loader.net);
     disti_archive_close(ctx, &loader.archive);
     if (good) return loader.net;
     dist_net_destroy(loader.net);

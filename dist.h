@@ -7617,8 +7617,8 @@ static void disti_net_pack(dist_net *net)
     if (net->half) disti_half_pack(net);
 }
 
-/* params to panels, each layer's units in the order of how often they are alive at points of the bounding sphere, for up to three of
-   the net's codes: what is left out, or put into pairs of 16 bits, then stands side by side in memory. */
+/* params to panels, each layer's units in the order of how often they are alive at points of the bounding sphere, for
+   up to three of the net's codes: what is left out, or put into pairs of 16 bits, then stands side by side. */
 static void disti_net_sort(const dist_context *ctx, dist_net *net)
 {
     enum { CODES = 3, ROUNDS = 3 };

@@ -2058,16 +2058,17 @@ static void disti_few_scalar(const disti_few *g)
 {
     for (int o = 0; o < (g->out + 7) / 8 * 8; o++) {
         const float *w = g->weights + (size_t)(o / 8) * (size_t)g->rows * 8 + o % 8;
+        float sum[DISTI_FEW_POINTS];
+        for (int c = 0; c < g->points; c++) sum[c] = g->bias[o];
+        for (int i = 0; i < g->count; i++) {
+            const size_t k = (size_t)g->list[i];
+            for (int c = 0; c < g->points; c++) sum[c] += w[k * 8] * g->x[(size_t)c * g->stride + k];
+        }
         g->most[o] = 0.0f;
-        for (size_t c = 0; c < (size_t)g->points; c++) {
-            float sum = g->bias[o];
-            for (int i = 0; i < g->count; i++) {
-                const size_t k = (size_t)g->list[i];
-                sum += w[k * 8] * g->x[c * g->stride + k];
-            }
-            sum = sum > 0.0f ? sum : 0.0f;
-            g->y[c * g->stride + (size_t)o] = sum;
-            g->most[o] = DISTI_MAX(g->most[o], sum);
+        for (int c = 0; c < g->points; c++) {
+            const float v = sum[c] > 0.0f ? sum[c] : 0.0f;
+            g->y[(size_t)c * g->stride + (size_t)o] = v;
+            g->most[o] = DISTI_MAX(g->most[o], v);
         }
     }
 }
@@ -7637,9 +7638,9 @@ static void disti_net_sort(const dist_context *ctx, dist_net *net)
     double u[3] = {0.5, 0.5, 0.5};
     memset(count, 0, all * sizeof(int));
     for (int round = 0; round < ROUNDS * DISTI_MAX(codes, 1); round++) {
-        int code = codes > 1 ? round / ROUNDS * (net->code_count - 1) / (codes - 1) : 0;
+        size_t code = codes > 1 ? (size_t)(round / ROUNDS) * (size_t)(net->code_count - 1) / (size_t)(codes - 1) : 0;
         float points[3 * DISTI_BLOCK], point[3 * DISTI_BLOCK];
-        if (round % ROUNDS == 0) disti_net_fold(net, codes ? net->codes + code * net->code_size : NULL, bias);
+        if (round % ROUNDS == 0) disti_net_fold(net, codes ? net->codes + code * (size_t)net->code_size : NULL, bias);
         for (int j = 0; j < DISTI_BLOCK;) {
             double square = 0.0;
             for (int k = 0; k < 3; k++) {

@@ -5525,6 +5525,7 @@ struct dist_shape {
     float half_error; /* largest of 16 bits at the samples of disti_shape_slope */
     int half;         /* what the net had then */
     int groups;       /* disti_groups_pay */
+    int many;         /* dist_field.many: two thirds or less of a block's multiply-adds are left with bounds */
     uint32_t all_alive; /* bit l: the samples of disti_shape_slope met no dead unit at layer l's input */
     dist_shape *texture; /* the net that colors it, with [code, color code] folded in; NULL: none */
     size_t store_block_size; /* of activations and deltas, for weight gradients; ctx->store holds store_blocks */
@@ -7124,7 +7125,7 @@ static int disti_groups_pay(dist_shape *shape, const float *points)
     size_t bytes = disti_block_layout(shape->net, disti_lane(shape->ctx, 0), &b);
     disti_kernels kernels = disti_kernels_for(shape->ctx->isa);
     disti_counter *counter = disti_counter_of(shape->ctx, 0), plain = *counter;
-    double some = 0.0;
+    double some = 0.0, more = 0.0;
     float sdf[DISTI_BLOCK];
     disti_group_layout(shape->net, disti_lane(shape->ctx, 0) + bytes, &b, &g);
     shape->groups = 0;
@@ -7139,10 +7140,11 @@ static int disti_groups_pay(dist_shape *shape, const float *points)
         some += disti_group_forward(shape, &kernels, &g, DISTI_BLOCK, g.points);
         for (int l = 0; l + 1 < shape->net->layers; l++) {
             double out = shape->net->layer[l].out;
-            some += out * (2.5 * g.alive_count[0][l] + 256.0) + 1800.0 * g.alive_units[0][l + 1];
+            more += out * (2.5 * g.alive_count[0][l] + 256.0) + 1800.0 * g.alive_units[0][l + 1];
         }
     }
-    double share = some / (counter->done - plain.done);
+    double all = counter->done - plain.done, share = (some + more) / all;
+    shape->many = some < 2.0 / 3.0 * all;
     return (share < 0.9) + (share < 1.15);
 }
 
@@ -7256,7 +7258,7 @@ DIST_API dist_field dist_shape_field(dist_shape *shape)
     field.clamp = net->clamp;
     field.cost = (float)dist_net_operations(net, 1);
     field.kinks = net->activation == DIST_ACTIVATION_RELU;
-    field.many = disti_net_groups(shape->ctx, net); /* neighbors share dead units */
+    field.many = shape->many;
     field.code_size = net->code_size;
     return field;
 }
@@ -8034,7 +8036,9 @@ static dist_status disti_loader_arrange(disti_loader *loader)
         return loader->status;
     dist_net *net = loader->net;
     dist_status status = disti_net_arrange(loader->ctx, net, loader->function, loader->skip, loader->skip_scale);
-    if (status != DIST_OK || !disti_net_sparse(net) || loader->ctx->blas.sgemm_fn) return status;
+    /* smaller ones' weights stay in the second cache, whatever their order */
+    int order = disti_net_sparse(net) && net->max_rows >= 384 && !loader->ctx->blas.sgemm_fn;
+    if (status != DIST_OK || !order) return status;
     net->unit_order = (int *)disti_alloc_array(loader->ctx, (size_t)net->layers * (size_t)net->max_rows, sizeof(int));
     return net->unit_order ? DIST_OK : DIST_OUT_OF_MEMORY;
 }
@@ -12804,7 +12808,7 @@ static void disti_backward_flush(disti_render_backward_job *job)
     const dist_tape *tape = job->tape;
     const dist_field *field = &tape->field;
     if (job->count == 0) return;
-    if (field->many) disti_backward_sort(job);
+    if (field->many || (field->kinks && field->cost > 1e5f)) disti_backward_sort(job);
     memset(tape->d_points, 0, 3 * job->count * sizeof(float));
     disti_field_backward_all(job->ctx, field, job->count, tape->points, tape->d_sdf, disti_render_seed, job,
                              tape->d_points, job->d_code);

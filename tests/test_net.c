@@ -430,10 +430,10 @@ static double largest_difference(size_t n, const float *a, const float *b)
 TEST(the_order_of_units_in_memory_does_not_show)
 {
     enum { N = 100 };
-    model_desc desc = {.hidden = 4, .width = 131, .skip = 4, .code_size = 3, .code_count = 2};
+    model_desc desc = {.hidden = 3, .width = 390, .skip = 4, .code_size = 3, .code_count = 2};
     dist_context *ctx = test_context();
     model m = model_make(&desc, 5);
-    enum { WEIGHTS = 100000 };
+    enum { WEIGHTS = 400000 };
     static float d_weights[2][WEIGHTS];
     float points[3 * N], u[3 * N], sdf[2][N], gradient[2][3 * N], d_sdf[N], d_points[3 * N];
     double d_code[2][3];
@@ -445,8 +445,8 @@ TEST(the_order_of_units_in_memory_does_not_show)
         int moved = 0;
         REQUIRE(net != NULL && net->unit_order != NULL);
         for (int l = 0; l + 1 < net->layers; l++) {
-            char seen[256] = {0};
-            REQUIRE(net->layer[l].out <= 256);
+            char seen[512] = {0};
+            REQUIRE(net->layer[l].out <= 512);
             for (int i = 0; i < net->layer[l].out; i++) {
                 int *unit = net->unit_order + l * net->max_rows + i;
                 REQUIRE(*unit >= 0 && *unit < net->layer[l].out && !seen[*unit]);

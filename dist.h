@@ -2551,7 +2551,7 @@ DISTI_PLAIN(scalar, static)
         DISTI_EACH(some, isa, 0, count, g->columns, R, W, (g, disti_listed(list, count, n, o), count - n, c))          \
         if (g->columns == DISTI_BLOCK) return;                                                                         \
         for (int i = 0; i < count; i++) g->mask[list[i]] &= ((uint64_t)1 << g->columns) - 1;                           \
-    }\
+    }                                                                                                                  \
     DISTI_FUNCTION void disti_gemm_back_##isa(const disti_gemm_back *g)                                                \
     {                                                                                                                  \
         const int rows = g->alive_rows ? g->alive_rows_count : g->rows;                                                \

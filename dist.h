@@ -6299,7 +6299,7 @@ static size_t disti_group_layout(const dist_net *net, unsigned char *base, const
     return at;
 }
 
-/* Whether it is tried: wide nets of units that can be dead and of inputs that are the point itself. */
+/* Whether bounds are tried: not where a BLAS takes the layers. */
 static int disti_net_groups(const dist_context *ctx, const dist_net *net)
 {
     int blas = ctx->blas.sgemm_fn && !net->unit_order && disti_net_narrowest(net) >= ctx->blas_width;
@@ -7115,8 +7115,8 @@ static void disti_shape_color_weights_fn(void *user, dist_context *ctx, size_t n
 static const double DISTI_PLASTIC[3] = {0.8191725133961645, 0.6710436067037893, 0.5497004779019703};
 
 /* Whether bounds find enough units dead: 0 no; 1 over blocks as close to each other as those of a reverse pass; 2 as a
-   picture has them, too. Tried around some of B points. Beside its multiply-adds a bound costs half of them again, a
-   unit's 256 more and the model of one that is alive 1800, as measured with AVX-512. */
+   picture has them, too. Tried around some of B points. Beside its multiply-adds a bound is taken to cost half of them
+   again, a unit's 256 more and the model of one that is alive 1800: estimates from times with AVX-512. */
 static int disti_groups_pay(dist_shape *shape, const float *points)
 {
     const int probes = 4;
@@ -8036,7 +8036,7 @@ static dist_status disti_loader_arrange(disti_loader *loader)
         return loader->status;
     dist_net *net = loader->net;
     dist_status status = disti_net_arrange(loader->ctx, net, loader->function, loader->skip, loader->skip_scale);
-    /* smaller ones' weights stay in the second cache, whatever their order */
+    /* of smaller ones so little comes from beyond the second cache that their order hardly matters */
     int order = disti_net_sparse(net) && net->max_rows >= 384 && !loader->ctx->blas.sgemm_fn;
     if (status != DIST_OK || !order) return status;
     net->unit_order = (int *)disti_alloc_array(loader->ctx, (size_t)net->layers * (size_t)net->max_rows, sizeof(int));

@@ -3278,6 +3278,61 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_MAC_LANE
 #undef DISTI_TABLE
 
+/* What spheres about points of one line cover of another: those about s[k], with these squares of their radii, where a
+   point s lies at line[0] + s + line[1] s along the other line, and off it by the root of
+   line[2] + line[3] s + line[4] s^2. n is a multiple of 4; from[k] = 3e38: the sphere does not meet it. */
+static void disti_spans(const float *s, const float *square, int n, const float line[5], float *from, float *to)
+{
+    int k = 0;
+#ifdef DISTI_X86
+    const __m128 zero = _mm_setzero_ps(), none = _mm_set1_ps(3e38f), at = _mm_set1_ps(line[0]);
+    const __m128 rate = _mm_set1_ps(line[1]), c0 = _mm_set1_ps(line[2]), c1 = _mm_set1_ps(line[3]);
+    for (const __m128 c2 = _mm_set1_ps(line[4]); k < n; k += 4) {
+        __m128 p = _mm_loadu_ps(s + k), along = _mm_add_ps(_mm_add_ps(at, p), _mm_mul_ps(rate, p));
+        __m128 off = _mm_add_ps(_mm_mul_ps(_mm_add_ps(_mm_mul_ps(c2, p), c1), p), c0);
+        __m128 half = _mm_sub_ps(_mm_loadu_ps(square + k), off), meets = _mm_cmpgt_ps(half, zero);
+        half = _mm_sqrt_ps(_mm_max_ps(half, zero));
+        _mm_storeu_ps(to + k, _mm_add_ps(along, half));
+        along = _mm_sub_ps(along, half);
+        _mm_storeu_ps(from + k, _mm_or_ps(_mm_and_ps(meets, along), _mm_andnot_ps(meets, none)));
+    }
+#endif
+    for (; k < n; k++) {
+        float along = line[0] + s[k] + line[1] * s[k];
+        float half = square[k] - ((line[4] * s[k] + line[3]) * s[k] + line[2]);
+        int meets = half > 0.0f;
+        half = meets ? sqrtf(half) : 0.0f;
+        from[k] = meets ? along - half : 3e38f;
+        to[k] = along + half;
+    }
+}
+
+/* The farthest end of the spans that begin at `end` or before, at least `end`; *next: where the first of the others
+   begins, 3e38 without one. n is a multiple of 4. */
+static float disti_spans_end(const float *from, const float *to, int n, float end, float *next)
+{
+    float most = end, least = 3e38f;
+    int k = 0;
+#ifdef DISTI_X86
+    __m128 ends = _mm_set1_ps(end), none = _mm_set1_ps(3e38f), mosts = ends, leasts = none;
+    for (; k < n; k += 4) {
+        __m128 a = _mm_loadu_ps(from + k), b = _mm_loadu_ps(to + k), joins = _mm_cmple_ps(a, ends);
+        mosts = _mm_max_ps(mosts, _mm_or_ps(_mm_and_ps(joins, b), _mm_andnot_ps(joins, ends)));
+        leasts = _mm_min_ps(leasts, _mm_or_ps(_mm_and_ps(joins, none), _mm_andnot_ps(joins, a)));
+    }
+    mosts = _mm_max_ps(mosts, _mm_movehl_ps(mosts, mosts));
+    leasts = _mm_min_ps(leasts, _mm_movehl_ps(leasts, leasts));
+    most = _mm_cvtss_f32(_mm_max_ss(mosts, _mm_shuffle_ps(mosts, mosts, 1)));
+    least = _mm_cvtss_f32(_mm_min_ss(leasts, _mm_shuffle_ps(leasts, leasts, 1)));
+#endif
+    for (; k < n; k++) {
+        if (from[k] <= end) most = DISTI_MAX(most, to[k]);
+        else least = DISTI_MIN(least, from[k]);
+    }
+    *next = least;
+    return most;
+}
+
 /*@ 04 field -------------------------------------------------------------------------------------------------------- */
 
 /* b = M a and b = M^T a, 3 x 3 row-major. */
@@ -9341,27 +9396,27 @@ enum { DISTI_TILE = 88, DISTI_TILE_USUAL = 64, DISTI_TILE_RAYS = (DISTI_TILE + 1
 
 /* Spheres that samples of the tile's rays prove empty, and the parts of each ray that those of the rays around it
    cover, looked up when it sets out. A ray that is about to step skips what is covered. Pool full: no more are kept. */
-enum { DISTI_POOL = 8192, DISTI_COVERS = 6 };
+enum { DISTI_POOL = 3072, DISTI_BALLS = 12, DISTI_COVERS = 12, DISTI_SPANS = 20 * DISTI_BALLS };
 
 typedef struct disti_cover {
-    float begin, end;                           /* covered without a gap; what lies before is of no use */
-    float from[DISTI_COVERS], to[DISTI_COVERS]; /* beyond a gap: disjoint, in no order */
-    int beyond;                                 /* how many */
+    float begin, end; /* covered without a gap; what lies before is of no use */
+    int count;        /* of the parts beyond the gap: disjoint, in order */
+    float from[DISTI_COVERS], to[DISTI_COVERS];
 } disti_cover;
 
-typedef struct disti_clear {
-    float center[3], square; /* of the radius */
-    int next;                /* the same pixel's next one, not larger in the picture */
-    int reach;               /* square of the radius in pixels, at most 255 */
+typedef struct disti_clear { /* a pixel's largest balls */
+    int count;
+    float s[DISTI_BALLS], square[DISTI_BALLS]; /* where along its ray; of the radius, 0 beyond the last */
 } disti_clear;
 
 typedef struct disti_balls {
-    int count, stride, window;            /* rays look at every stride-th pixel less than window away */
-    int head[DISTI_TILE_RAYS];            /* a pixel's largest ball */
-    unsigned char reach[DISTI_TILE_RAYS]; /* its reach; 0: the pixel has none */
-    unsigned char looked[DISTI_TILE_RAYS]; /* the pixel's cover is filled in */
-    disti_clear ball[DISTI_POOL];
-    disti_cover cover[DISTI_TILE_RAYS];
+    int stride, window;                       /* rays look at every stride-th pixel less than window away */
+    int clears, covers;                       /* taken of the pools */
+    unsigned char reach[DISTI_TILE_RAYS];     /* square of the pixel's largest radius in pixels, 1 to 255; 0: no ball */
+    unsigned short clear_of[DISTI_TILE_RAYS]; /* the place of a pixel's balls, if it has any */
+    unsigned short cover_of[DISTI_TILE_RAYS]; /* 1 + the place of its ray's cover; 0: not looked up yet */
+    disti_clear clear[DISTI_POOL];
+    disti_cover cover[DISTI_POOL];
 } disti_balls;
 
 /* A task's share of how.max_queries. Each hit owes per_hit queries for its normal and color, so while marching a query
@@ -9460,152 +9515,143 @@ static void disti_ray_point(const disti_ray *ray, float s, float p[3])
     for (int i = 0; i < 3; i++) p[i] = ray->origin[i] + s * ray->direction[i];
 }
 
+/* From now on rays look this far, and none has looked yet: the covers' places are free again. */
+static void disti_balls_look(disti_balls *balls, int stride, int window)
+{
+    balls->stride = stride;
+    balls->window = window;
+    balls->covers = 0;
+    memset(balls->cover_of, 0, sizeof balls->cover_of);
+}
+
 /* Adds [from, to] to the parts beyond the end; where all places are taken the farthest gives way. */
 static void disti_cover_add(disti_cover *cover, float from, float to)
 {
-    int count = cover->beyond, farthest = 0;
-    for (int i = 0; i < count;) {
-        if (cover->to[i] >= from && cover->from[i] <= to) { /* they meet: one */
-            from = DISTI_MIN(from, cover->from[i]);
-            to = DISTI_MAX(to, cover->to[i]);
-            cover->from[i] = cover->from[--count];
-            cover->to[i] = cover->to[count];
-        } else {
-            i++;
-        }
+    int k = 0, n = cover->count;
+    while (k < n && cover->to[k] < from) k++;
+    int last = k; /* it meets parts k to last - 1: one */
+    for (; last < n && cover->from[last] <= to; last++) {
+        from = DISTI_MIN(from, cover->from[last]);
+        to = DISTI_MAX(to, cover->to[last]);
     }
-    for (int i = 1; i < count; i++) farthest = cover->from[i] > cover->from[farthest] ? i : farthest;
-    cover->beyond = count;
-    if (count == DISTI_COVERS && cover->from[farthest] <= from) return;
-    int place = count < DISTI_COVERS ? cover->beyond++ : farthest;
-    cover->from[place] = from;
-    cover->to[place] = to;
-}
-
-static void disti_publish(const disti_tracer *tracer, const disti_bench *bench, int index, const float *p, float f)
-{
-    disti_balls *balls = bench->balls;
-    const disti_ray *ray = &bench->rays[index];
-    float radius = disti_empty(tracer, f);
-    if (!(radius > bench->least) || balls->count >= DISTI_POOL) return;
-    float pixels = radius / (((float)ray->base + ray->q) * ray->footprint * 2.0f);
-    disti_clear *ball = &balls->ball[balls->count];
-    memcpy(ball->center, p, 3 * sizeof(float));
-    ball->square = radius * radius;
-    ball->reach = pixels > 0.0f && pixels < 15.9f ? (int)(pixels * pixels) : 255;
-    int *at = &balls->head[index], left = balls->reach[index] > 0;
-    while (left && balls->ball[*at].reach >= ball->reach) {
-        at = &balls->ball[*at].next;
-        left = *at >= 0;
+    if (last == k && n == DISTI_COVERS) {
+        if (k == n) return;
+        n--;
     }
-    ball->next = left ? *at : -1;
-    *at = balls->count++;
-    balls->reach[index] = (unsigned char)DISTI_MAX(1, DISTI_MAX(ball->reach, (int)balls->reach[index]));
-    if (balls->looked[index]) disti_cover_add(&balls->cover[index], ray->q - radius, ray->q + radius);
+    size_t behind = (size_t)(n - last) * sizeof(float);
+    memmove(cover->from + k + 1, cover->from + last, behind);
+    memmove(cover->to + k + 1, cover->to + last, behind);
+    cover->count = n + 1 - (last - k);
+    cover->from[k] = from;
+    cover->to[k] = to;
 }
 
 /* Moves the cover's end to behind the parts that it meets, and drops these. */
 static float disti_cover_end(disti_cover *cover)
 {
-    for (int i = 0; i < cover->beyond;) {
-        if (cover->from[i] > cover->end) {
-            i++;
-            continue;
-        }
-        cover->end = DISTI_MAX(cover->end, cover->to[i]);
-        cover->from[i] = cover->from[--cover->beyond];
-        cover->to[i] = cover->to[cover->beyond];
-        i = 0;
-    }
+    int k = 0;
+    for (; k < cover->count && cover->from[k] <= cover->end; k++) cover->end = DISTI_MAX(cover->end, cover->to[k]);
+    if (k == 0) return cover->end;
+    cover->count -= k;
+    memmove(cover->from, cover->from + k, (size_t)cover->count * sizeof(float));
+    memmove(cover->to, cover->to + k, (size_t)cover->count * sizeof(float));
     return cover->end;
 }
 
-enum { DISTI_PARTS = 192 };
-
-typedef struct disti_part {
-    float from, to;
-} disti_part;
-
-/* Returns the end of the cover, moved through a pixel's balls, those of at least this reach; what they cover beyond a
-   gap is added to the *count in parts. */
-static float disti_clear_parts(const disti_clear *ball, const disti_clear *pool, int reach, const float o[3],
-                               const float v[3], float end, disti_part parts[DISTI_PARTS], int *count)
+static void disti_publish(const disti_tracer *tracer, const disti_bench *bench, int index, float f)
 {
-    int n = *count;
-    for (; ball->reach >= reach && n < DISTI_PARTS; ball = pool + ball->next) {
-        float d[3] = {ball->center[0] - o[0], ball->center[1] - o[1], ball->center[2] - o[2]};
-        float along = d[0] * v[0] + d[1] * v[1] + d[2] * v[2];
-        float half = ball->square - (d[0] * d[0] + d[1] * d[1] + d[2] * d[2] - along * along);
-        float ahead = end - along;
-        if (half > 0.0f && !(ahead > 0.0f && half <= ahead * ahead)) {
-            half = sqrtf(half);
-            if (along - half <= end) {
-                end = along + half;
-            } else {
-                parts[n].from = along - half;
-                parts[n++].to = along + half;
-            }
-        }
-        if (ball->next < 0) break;
+    disti_balls *balls = bench->balls;
+    const disti_ray *ray = &bench->rays[index];
+    float radius = disti_empty(tracer, f), square = radius * radius;
+    if (!(radius > bench->least)) return;
+    if (balls->cover_of[index]) {
+        disti_cover *cover = &balls->cover[balls->cover_of[index] - 1];
+        if (ray->q - radius <= cover->end) cover->end = DISTI_MAX(cover->end, ray->q + radius);
+        else disti_cover_add(cover, ray->q - radius, ray->q + radius);
     }
-    *count = n;
-    return end;
+    if (balls->reach[index] == 0) {
+        if (balls->clears == DISTI_POOL) return;
+        balls->clear_of[index] = (unsigned short)balls->clears;
+        memset(&balls->clear[balls->clears++], 0, sizeof(disti_clear));
+    }
+    disti_clear *clear = &balls->clear[balls->clear_of[index]];
+    int place = clear->count;
+    if (place < DISTI_BALLS) {
+        clear->count++;
+    } else { /* instead of the smallest */
+        place = 0;
+        for (int i = 1; i < DISTI_BALLS; i++) place = clear->square[i] < clear->square[place] ? i : place;
+        if (clear->square[place] >= square) return;
+    }
+    clear->s[place] = ray->q;
+    clear->square[place] = square;
+    float pixels = radius / (((float)ray->base + ray->q) * ray->footprint * 2.0f);
+    int reach = pixels > 0.0f && pixels < 15.9f ? DISTI_MAX((int)(pixels * pixels), 1) : 255;
+    balls->reach[index] = (unsigned char)DISTI_MAX(reach, (int)balls->reach[index]);
 }
 
-/* Fills in the cover of a ray, whose end is where it sets out: in order of where they begin, the parts that no gap is
-   before move it on, the others are joined where they meet. */
+/* Fills in the cover of a ray, whose end is where it sets out: of the spans that the balls of the pixels around it have
+   on it, those that join the end move it on, then the others join each other, from the nearest on. Of a ray o + s v
+   and ours, O + S V, with e = o - O and w = v - V: S = e.V + s + s w.V, off by e + s w without its part along V. */
 static void disti_cover_begin(const disti_bench *bench, int index, const disti_ray *ray, disti_cover *cover)
 {
     const disti_balls *balls = bench->balls;
-    const float o[3] = {ray->origin[0], ray->origin[1], ray->origin[2]};
-    const float v[3] = {ray->direction[0], ray->direction[1], ray->direction[2]};
-    disti_part parts[DISTI_PARTS];
-    float end = cover->end;
-    int width = bench->width, x = index % width, y = index / width, h = balls->stride, window = balls->window;
+    float from[DISTI_SPANS], to[DISTI_SPANS], next = 0.0f;
+    int width = bench->width, x = index % width, y = index / width, h = balls->stride, window = balls->window, n = 0;
     int x0 = DISTI_MAX(x - window + h, 0) / h * h, x1 = DISTI_MIN(x + window, width - 1);
-    int y0 = DISTI_MAX(y - window + h, 0) / h * h, y1 = DISTI_MIN(y + window, bench->height - 1), count = 0;
+    int y0 = DISTI_MAX(y - window + h, 0) / h * h, y1 = DISTI_MIN(y + window, bench->height - 1);
     for (int row = y0; row <= y1; row += h) {
         const unsigned char *reach = balls->reach + row * width;
         for (int u = x0, most = (row - y) * (row - y); u <= x1; u += h) {
-            int away = most + (u - x) * (u - x);
-            if (reach[u] == 0 || reach[u] < away) continue;
-            end = disti_clear_parts(balls->ball + balls->head[row * width + u], balls->ball, away, o, v, end, parts,
-                                    &count);
+            if (reach[u] == 0 || reach[u] < most + (u - x) * (u - x) || n > DISTI_SPANS - DISTI_BALLS) continue;
+            const disti_ray *other = &bench->rays[row * width + u];
+            const disti_clear *clear = &balls->clear[balls->clear_of[row * width + u]];
+            float e[3], w[3], line[5] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
+            for (int i = 0; i < 3; i++) {
+                e[i] = other->origin[i] - ray->origin[i];
+                w[i] = other->direction[i] - ray->direction[i];
+                line[0] += e[i] * ray->direction[i];
+                line[1] += w[i] * ray->direction[i];
+            }
+            for (int i = 0; i < 3; i++) {
+                float a = e[i] - line[0] * ray->direction[i], b = w[i] - line[1] * ray->direction[i];
+                line[2] += a * a;
+                line[3] += 2.0f * a * b;
+                line[4] += b * b;
+            }
+            int count = (clear->count + 3) / 4 * 4;
+            disti_spans(clear->s, clear->square, count, line, from + n, to + n);
+            n += count;
         }
     }
-    int left = 0, beyond = 0;
-    for (int i = 0; i < count; i++) {
-        disti_part part = parts[i];
-        if (part.to <= end) continue;
-        int k = left++;
-        for (; k > 0 && parts[k - 1].from > part.from; k--) parts[k] = parts[k - 1];
-        parts[k] = part;
-    }
-    for (int i = 0; i < left; i++) {
-        if (parts[i].from <= end) {
-            end = DISTI_MAX(end, parts[i].to);
-        } else if (beyond > 0 && parts[i].from <= cover->to[beyond - 1]) {
-            cover->to[beyond - 1] = DISTI_MAX(cover->to[beyond - 1], parts[i].to);
-        } else {
-            if (beyond == DISTI_COVERS) break;
-            cover->from[beyond] = parts[i].from;
-            cover->to[beyond++] = parts[i].to;
-        }
-    }
+    float begin = cover->end, end, far = begin;
+    do {
+        end = far;
+        far = disti_spans_end(from, to, n, end, &next);
+    } while (far > end);
     cover->end = end;
-    cover->beyond = beyond;
+    for (cover->count = 0; cover->count < DISTI_COVERS && next < 3e38f; cover->count++) {
+        begin = far = next;
+        do {
+            end = far;
+            far = disti_spans_end(from, to, n, end, &next);
+        } while (far > end);
+        cover->from[cover->count] = begin;
+        cover->to[cover->count] = end;
+    }
 }
 
 /* How far along the ray the balls around it cover it without a gap, from s on. */
 static float disti_covered(const disti_bench *bench, int index, const disti_ray *ray, float s)
 {
     disti_balls *balls = bench->balls;
-    disti_cover *cover = &balls->cover[index];
-    int looked = balls->looked[index];
+    int looked = balls->cover_of[index] > 0;
+    if (!looked && balls->covers == DISTI_POOL) return s;
+    if (!looked) balls->cover_of[index] = (unsigned short)++balls->covers;
+    disti_cover *cover = &balls->cover[balls->cover_of[index] - 1];
     if (!looked || s < cover->begin || s > cover->end) cover->begin = cover->end = s;
     if (looked) return disti_cover_end(cover);
     disti_cover_begin(bench, index, ray, cover);
-    balls->looked[index] = 1;
     return cover->end;
 }
 
@@ -9699,7 +9745,7 @@ static size_t disti_trace_rounds(const disti_tracer *tracer, int worker, const d
             }
             if (ray->mode >= DISTI_BAND) bench->stats->refine_queries++;
             else bench->stats->march_queries++;
-            if (bench->balls) disti_publish(tracer, bench, bench->index[i], bench->points + 3 * i, bench->sdf[i]);
+            if (bench->balls) disti_publish(tracer, bench, bench->index[i], bench->sdf[i]);
             disti_stats_slope(tracer, ray, bench->sdf[i], bench->stats);
             if (disti_ray_advance(tracer, ray, bench->sdf[i])) {
                 bench->index[kept++] = bench->index[i];
@@ -10557,11 +10603,9 @@ static void disti_lattice_balls(const disti_tracer *tracer, const disti_tile *ti
     bench->width = tile->width;
     bench->height = tile->height;
     bench->least = 0.4f * disti_pixel_width(tracer, tile);
-    bench->balls->count = 0;
-    bench->balls->stride = DISTI_LATTICE;
-    bench->balls->window = 3;
-    memset(bench->balls->reach, 0, (size_t)(tile->width * tile->height));
-    memset(bench->balls->looked, 0, (size_t)(tile->width * tile->height));
+    bench->balls->clears = 0;
+    memset(bench->balls->reach, 0, sizeof bench->balls->reach);
+    disti_balls_look(bench->balls, DISTI_LATTICE, 3);
 }
 
 static void disti_trace_lattice(const disti_tracer *tracer, int worker, const disti_tile *tile, disti_bench *bench)
@@ -10591,9 +10635,8 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
     DIST_ASSERT(6 * DISTI_TILE_RAYS * sizeof(float) <= DISTI_REST_BYTES);
     if (tile->cheap && tile->normals) bench->gradient = (float *)(void *)bench->rest; /* the cones are done with */
     for (int h = DISTI_LATTICE / 2; h > 0; h /= 2) {
-        if (bench->balls) bench->balls->stride = h;
-        if (bench->balls) bench->balls->window = DISTI_MIN(h + 3, 6);
         for (int pass = 1; pass <= 2; pass++) { /* between two known pixels, then amid four */
+            if (bench->balls) disti_balls_look(bench->balls, h, DISTI_MIN(h + 3, 6));
             for (int y = pass == 1 ? 0 : h; y < tile->height; y += pass == 1 ? h : 2 * h) {
                 for (int x = pass == 1 && y & h ? 0 : h; x < tile->width; x += 2 * h) {
                     int index = y * tile->width + x;

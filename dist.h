@@ -8643,6 +8643,8 @@ typedef struct disti_ray {
     float width;        /* bracket's width at first; before: longest first step to trust, in epsilons */
     float best, fbest;  /* sample of smallest |f| */
     float error;
+    float crept, fcrept; /* front where samples near the surface began to stand too far apart to prove what is between
+                            them; fcrept = 0: they do not */
     float sign;         /* -1: looking for the way out of the solid */
     unsigned short steps;
     unsigned char mode, status;
@@ -8873,7 +8875,8 @@ static int disti_ray_ask(disti_ray *ray, int mode, float q)
 /* How far before a hit the surface may be for a ray that came down steeply, but crosses 0 slowly, by `falls`: between
    the two f bends, and where it is as flat as that, ripples of the surface's |f| may have crossed 0 before. Over a
    bracket that is flat from the start they may have done so anywhere in it, and where what was sampled before it says
-   that f crosses 0 earlier (disti_ray_bent), from there on. No less than what f's noise hides, at a slope that is known
+   that f crosses 0 earlier (disti_ray_bent), from there on; or if it falls by more than twice as much as on the way
+   along the surface that led here (disti_ray_creeps), anywhere on that. No less than what f's noise hides, at a slope that is known
    no better than as a 16th of the Lipschitz figure where the bracket's ends differ by no more than noise. */
 static float disti_ray_kink(const disti_tracer *tracer, const disti_ray *ray, float falls)
 {
@@ -8881,6 +8884,8 @@ static float disti_ray_kink(const disti_tracer *tracer, const disti_ray *ray, fl
     if (falls < 0.15f * tracer->lipschitz && ray->incline < -2.0f * falls)
         flat = 12.0f * disti_ray_epsilon(tracer, ray, ray->a);
     flat = DISTI_MAX(flat < most * falls ? flat / falls : most, ray->target);
+    float way = ray->b - ray->crept;
+    if (ray->fcrept > 0.0f && falls * way > 2.0f * ray->fcrept) flat = DISTI_MAX(flat, DISTI_MIN(way, 0.5f * most));
     if (ray->fa - ray->fb < 2.0f * tracer->noise) flat = DISTI_MAX(flat, 16.0f * tracer->noise / tracer->lipschitz);
     return ray->incline > -0.12f * tracer->lipschitz ? DISTI_MAX(flat, DISTI_MIN(ray->width, most)) : flat;
 }
@@ -8995,6 +9000,21 @@ static float disti_ray_floor(const disti_tracer *tracer, const disti_ray *ray)
     float patience = ray->steps > 20 ? 1.0f + 0.1f * (float)(ray->steps - 20) : 1.0f;
     float pixel = (float)(ray->base + (double)ray->s) * ray->footprint, radius = tracer->field->radius;
     return patience * DISTI_MAX(5e-4f * radius, DISTI_MIN(pixel, 3e-3f * radius));
+}
+
+/* Notes the front of a step to q that was trusted, though nothing proves it, along a surface so near that ripples of f
+   may cross 0 there, or past spheres to where f is all but 0; until f is larger again. */
+static void disti_ray_creeps(const disti_tracer *tracer, disti_ray *ray, float f, int trusted)
+{
+    float ripple = 10.0f * disti_default_epsilon(tracer);
+    int skips = ray->mode == DISTI_SKIP && f < disti_ray_near(tracer, ray, ray->q);
+    if (skips || (trusted && f < ripple && ray->slope > -0.3f * tracer->lipschitz)) {
+        if (ray->fcrept > 0.0f || tracer->how.certified) return;
+        ray->crept = ray->s;
+        ray->fcrept = ray->f;
+    } else if (f >= ripple) {
+        ray->fcrept = 0.0f;
+    }
 }
 
 /* Where to look next from the front: near the surface a jump to where the last slope says that f ends, at most three
@@ -9344,6 +9364,7 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
             radius = disti_empty(tracer, ray->f);
             return disti_ray_ask(ray, DISTI_MARCH, DISTI_MIN(ray->s + DISTI_MAX(radius, spacing), ray->leave));
         }
+        disti_ray_creeps(tracer, ray, f, back && gap > 0.0f);
         if (ray->fb < 0.0f) { /* a crossing lies before b: is there room for another before it? */
             if (ray->b <= q) return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->b, ray->fb);
             if (disti_ray_alone(tracer, q, f, ray->b, ray->fb, 1e-3f))
@@ -9396,7 +9417,7 @@ enum { DISTI_TILE = 88, DISTI_TILE_USUAL = 64, DISTI_TILE_RAYS = (DISTI_TILE + 1
 
 /* Spheres that samples of the tile's rays prove empty, and the parts of each ray that those of the rays around it
    cover, looked up when it sets out. A ray that is about to step skips what is covered. Pool full: no more are kept. */
-enum { DISTI_POOL = 3072, DISTI_BALLS = 12, DISTI_COVERS = 12, DISTI_SPANS = 20 * DISTI_BALLS };
+enum { DISTI_POOL = 2816, DISTI_BALLS = 12, DISTI_COVERS = 12, DISTI_SPANS = 20 * DISTI_BALLS };
 
 typedef struct disti_cover {
     float begin, end; /* covered without a gap; what lies before is of no use */
@@ -9454,7 +9475,7 @@ typedef struct disti_bench { /* the work bench of one task */
     int cones;           /* in rest, until something else is put there: the tile's */
 } disti_bench;
 
-enum { DISTI_REST_BYTES = 704 * 1024 };
+enum { DISTI_REST_BYTES = 640 * 1024 };
 
 static void disti_bench_init(const dist_context *ctx, int worker, disti_bench *bench)
 {
@@ -10661,7 +10682,7 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
 static void disti_trace_doubt(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench)
 {
     int n = tile->width * tile->height;
-    float most = 0.02f * tracer->field->radius;
+    float most = 0.02f * tracer->field->radius, farthest = 0.03f * tracer->field->radius;
     for (int i = 0, x = -1, y = 0; i < n; i++) {
         if (++x == tile->width) x = 0, y++;
         const float *depth = bench->depth + i;
@@ -10671,7 +10692,7 @@ static void disti_trace_doubt(const disti_tracer *tracer, const disti_tile *tile
         float falls = ray->slope < 0.0f ? -ray->slope : ray->slope;
         if (falls < 0.06f * tracer->lipschitz && ray->sign > 0.0f) {
             float flat = 8.0f * DISTI_MAX(disti_ray_epsilon(tracer, ray, ray->best), disti_default_epsilon(tracer));
-            ray->error = DISTI_MAX(ray->error, flat < most * falls ? flat / falls : most);
+            ray->error = DISTI_MAX(ray->error, flat < farthest * falls ? flat / falls : farthest);
         }
         for (int axis = 0; axis < 2; axis++) {
             int at = axis ? y : x, end = axis ? tile->height : tile->width;

@@ -8875,9 +8875,10 @@ static int disti_ray_ask(disti_ray *ray, int mode, float q)
 /* How far before a hit the surface may be for a ray that came down steeply, but crosses 0 slowly, by `falls`: between
    the two f bends, and where it is as flat as that, ripples of the surface's |f| may have crossed 0 before. Over a
    bracket that is flat from the start they may have done so anywhere in it, and where what was sampled before it says
-   that f crosses 0 earlier (disti_ray_bent), from there on; or if it falls by more than twice as much as on the way
-   along the surface that led here (disti_ray_creeps), anywhere on that. No less than what f's noise hides, at a slope that is known
-   no better than as a 16th of the Lipschitz figure where the bracket's ends differ by no more than noise. */
+   that f crosses 0 earlier (disti_ray_bent), from there on; or, if f falls more than twice as steeply as on the way
+   along the surface that led here (disti_ray_creeps), anywhere on that way. No less than what f's noise hides, at a
+   slope that is known no better than as a 16th of the Lipschitz figure where the bracket's ends differ by no more than
+   noise. */
 static float disti_ray_kink(const disti_tracer *tracer, const disti_ray *ray, float falls)
 {
     float most = 0.04f * tracer->field->radius, flat = tracer->noise;
@@ -9861,6 +9862,7 @@ static float disti_ray_bound(const disti_tracer *tracer, const disti_ray *ray)
     if (ray->status != DIST_RAY_HIT && ray->status != DIST_RAY_UNRESOLVED) return ray->error;
     if (disti_is_coarse(field)) {
         float slope = ray->slope < 0.0f ? -ray->slope : ray->slope, most = 0.5f * tracer->lipschitz;
+        if (slope > 4.0f * most) slope = 0.06f * tracer->lipschitz; /* a crossing of the noise's, not of f */
         slope = slope > 0.0f && slope < most ? DISTI_MAX(slope, 0.06f * tracer->lipschitz) : most;
         coarse = (double)field->coarse_error / (double)slope;
     }

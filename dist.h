@@ -1706,6 +1706,8 @@ typedef struct disti_kernels {
     /* points (B, 3) to rows (3, B), and back */
     void (*rows)(const float *points, float *rows);
     void (*points)(const float *rows, float *points);
+    /* a coordinate's rows of the encoding: disti_angles */
+    void (*angles)(double base, int levels, const float *x, size_t stride, float *sines, float *cosines);
     /* y <- y + s x in double */
     void (*axpy)(size_t n, double s, const float *x, double *y);
     /* y <- max(0, y) and the bits of the positive lanes of each row */
@@ -2173,6 +2175,23 @@ DISTI_INLINE void disti_points(const float *DISTI_RESTRICT rows, float *DISTI_RE
     }
 }
 
+/* Rows sin(base 2^k x) and cos(base 2^k x), k < levels, `stride` floats apart, by doubling the angle in double. */
+DISTI_INLINE void disti_angles(double base, int levels, const float *DISTI_RESTRICT x, size_t stride,
+                               float *DISTI_RESTRICT sines, float *DISTI_RESTRICT cosines)
+{
+    double s[DISTI_BLOCK], co[DISTI_BLOCK];
+    for (size_t c = 0; c < DISTI_BLOCK; c++) disti_sincos(base * (double)x[c], &s[c], &co[c]);
+    for (int k = 0; k < levels; k++, sines += stride, cosines += stride) {
+        for (size_t c = 0; c < DISTI_BLOCK; c++) {
+            sines[c] = (float)s[c];
+            cosines[c] = (float)co[c];
+            double twice = 2.0 * s[c] * co[c];
+            co[c] = 1.0 - 2.0 * s[c] * s[c];
+            s[c] = twice;
+        }
+    }
+}
+
 /* These of a block from the same text for every instruction set; scalar is the definition, as above. */
 #define DISTI_PLAIN(isa, function)                                                                                     \
     function void disti_activate_##isa(int activation, float scale, size_t n, float *y, float *slope)                  \
@@ -2191,6 +2210,11 @@ DISTI_INLINE void disti_points(const float *DISTI_RESTRICT rows, float *DISTI_RE
     }                                                                                                                  \
     function void disti_rows_##isa(const float *points, float *rows) { disti_rows(points, rows); }                     \
     function void disti_points_##isa(const float *rows, float *points) { disti_points(rows, points); }                 \
+    function void disti_angles_##isa(double base, int levels, const float *x, size_t stride, float *sines,             \
+                                      float *cosines)                                                                  \
+    {                                                                                                                  \
+        disti_angles(base, levels, x, stride, sines, cosines);                                                         \
+    }                                                                                                                  \
     function void disti_axpy_##isa(size_t n, double s, const float *x, double *y)                                      \
     {                                                                                                                  \
         disti_axpy(n, s, x, y);                                                                                        \
@@ -3162,6 +3186,7 @@ static uint32_t disti_f16_bits(float x) /* not called: dist_net_set_half refuses
     kernels.axpy = disti_axpy_##isa; \
     kernels.rows = disti_rows_##isa; \
     kernels.points = disti_points_##isa; \
+    kernels.angles = disti_angles_##isa; \
     kernels.relu = disti_relu_##isa; \
     kernels.activate = disti_activate_##isa; \
     kernels.gemm_some = disti_gemm_some_##isa; \
@@ -5687,20 +5712,14 @@ static void disti_encode(const dist_net *net, const disti_kernels *kernels, size
         memcpy(last + 3 * c, points + 3 * (c < n ? c : n - 1), 3 * sizeof(float));
     if (n < DISTI_BLOCK) points = last;
     if (net->raw) kernels->rows(points, rows);
-    for (size_t c = 0; c < DISTI_BLOCK && net->levels > 0; c++) {
-        const float *p = points + 3 * c;
-        for (int axis = 0; axis < 3; axis++) {
-            double s, co;
-            disti_sincos(net->base * (double)p[axis], &s, &co);
-            for (int k = 0; k < net->levels; k++) {
-                rows[(size_t)disti_encoding_row(net, k, axis, 0) * DISTI_BLOCK + c] = (float)s;
-                rows[(size_t)disti_encoding_row(net, k, axis, 1) * DISTI_BLOCK + c] = (float)co;
-                double twice = 2.0 * s * co;
-                co = 1.0 - 2.0 * s * s;
-                s = twice;
-            }
-        }
-    }
+    if (net->levels == 0) return;
+    float x[3 * DISTI_BLOCK];
+    kernels->rows(points, x);
+    size_t stride = (size_t)(net->order == DISTI_ORDER_SIN_COS ? 6 : 3) * DISTI_BLOCK;
+    for (int axis = 0; axis < 3; axis++)
+        kernels->angles(net->base, net->levels, x + axis * DISTI_BLOCK, stride,
+                        rows + (size_t)disti_encoding_row(net, 0, axis, 0) * DISTI_BLOCK,
+                        rows + (size_t)disti_encoding_row(net, 0, axis, 1) * DISTI_BLOCK);
 }
 
 /* backward  d_p = d_raw + sum_k b 2^k (cos(b 2^k p) d_sin_k - sin(b 2^k p) d_cos_k)

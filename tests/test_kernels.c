@@ -406,6 +406,14 @@ static void check_plain_case(const disti_kernels *kernels, test_random *random, 
         kernels->norm_back(size.rows, gamma, half, slope_a, inverse[0], b);
         CHECK_NEAR_ARRAY(n, a, b, 1e-3); /* one row: divided by sigma = 0.1 twice and more */
     }
+    float angle_a[4 * TEST_BLOCK], angle_b[4 * TEST_BLOCK]; /* two levels of sines and cosines, each beside the other */
+    scalar.angles(3.14159265, 2, x, 2 * TEST_BLOCK, angle_a, angle_a + TEST_BLOCK);
+    kernels->angles(3.14159265, 2, x, 2 * TEST_BLOCK, angle_b, angle_b + TEST_BLOCK);
+    CHECK_NEAR_ARRAY(4 * TEST_BLOCK, angle_a, angle_b, 1.2e-7);
+    for (int c = 0; c < TEST_BLOCK; c++) {
+        CHECK_NEAR(sin(3.14159265 * (double)x[c]), angle_a[c], 1.2e-7);
+        CHECK_NEAR(cos(2 * 3.14159265 * (double)x[c]), angle_a[3 * TEST_BLOCK + c], 1.2e-7);
+    }
     release(x, n);
     release(a, n);
     release(b, n);
@@ -552,9 +560,59 @@ TEST(the_best_instruction_set_is_the_last_that_the_processor_has)
     CHECK_EQUAL(best, disti_cpu_best());
 }
 
+TEST(spans_are_what_spheres_cover_of_another_line)
+{
+    enum { COUNT = 12 };
+    test_random random = test_random_seed(5);
+    for (int round = 0; round < 200; round++) {
+        float s[COUNT], square[COUNT], line[5], from[COUNT], to[COUNT];
+        double e[3], w[3], v[3] = {0.6, 0, 0.8}, along_e = 0, along_w = 0, part[5] = {0, 0, 0, 0, 0};
+        for (int i = 0; i < 3; i++) {
+            e[i] = test_random_double(&random, -0.3, 0.3);
+            w[i] = test_random_double(&random, -0.1, 0.1);
+            along_e += e[i] * v[i];
+            along_w += w[i] * v[i];
+        }
+        for (int i = 0; i < 3; i++) {
+            double a = e[i] - along_e * v[i], b = w[i] - along_w * v[i];
+            part[2] += a * a;
+            part[3] += 2 * a * b;
+            part[4] += b * b;
+        }
+        part[0] = along_e;
+        part[1] = along_w;
+        for (int i = 0; i < 5; i++) line[i] = (float)part[i];
+        test_random_fill(&random, COUNT, s, -1.0f, 1.0f);
+        test_random_fill(&random, COUNT, square, 0.0f, 0.2f);
+        square[COUNT - 1] = 0;
+        disti_spans(s, square, COUNT, line, from, to);
+        CHECK(from[COUNT - 1] > 2e38f || part[2] < 1e-6);
+        for (int k = 0; k < COUNT; k++) { /* the ends lie on the sphere about e + s (v + w) */
+            for (int end = 0; end < 2 && from[k] < 2e38f; end++) {
+                double at = end ? (double)to[k] : (double)from[k], distance = 0;
+                for (int i = 0; i < 3; i++) {
+                    double d = e[i] + (double)s[k] * (v[i] + w[i]) - at * v[i];
+                    distance += d * d;
+                }
+                CHECK_NEAR((double)square[k], distance, 1e-5);
+            }
+            double p = (double)s[k], off = part[2] + p * (part[3] + p * part[4]);
+            CHECK((from[k] > 2e38f) == (off > (double)square[k]) || fabs(off - (double)square[k]) < 1e-6);
+        }
+        float next, first = 3e38f, most = -0.4f, end = disti_spans_end(from, to, COUNT, -0.4f, &next);
+        for (int k = 0; k < COUNT; k++) {
+            if (from[k] <= -0.4f && to[k] > most) most = to[k];
+            if (from[k] > -0.4f && from[k] < first) first = from[k];
+        }
+        CHECK_NEAR((double)most, end, 0);
+        CHECK_NEAR((double)first, next, 0);
+    }
+}
+
 int main(int argc, char **argv)
 {
     test_begin(argc, argv);
+    RUN(spans_are_what_spheres_cover_of_another_line);
     RUN(the_processor_is_recognized_as_the_compiler_does_it);
     RUN(the_best_instruction_set_is_the_last_that_the_processor_has);
     RUN_KERNELS(scalar);

@@ -9023,7 +9023,8 @@ static float disti_ray_floor(const disti_tracer *tracer, const disti_ray *ray)
 }
 
 /* Notes the front of a step to q that was trusted, though nothing proves it, along a surface so near that ripples of f
-   may cross 0 there, or past spheres to where f is all but 0; until f is larger again. */
+   may cross 0 there (to 10 of the default epsilon: chosen by what decoders do, not derived), or past spheres to where f
+   is all but 0; until f is larger again. */
 static void disti_ray_creeps(const disti_tracer *tracer, disti_ray *ray, float f, int trusted)
 {
     float ripple = 10.0f * disti_default_epsilon(tracer);

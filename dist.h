@@ -596,7 +596,8 @@ typedef struct dist_images {
                               background. Behind the edge of a nearer surface it reaches to that; with
                               how.certified only where a slope beyond the Lipschitz figure was met in the same tile.
                               With field.coarse_fn for eval_fn field.coarse_error is counted in, near outlines by
-                              what is seen beside; a ray that just meets an edge may go on far behind it.
+                              what is seen beside; a ray that just meets an edge may go on far behind it. Where a
+                              ray crept along a surface before its hit, up to 0.02 of the radius of that way, too.
                               DIST_TRACE_PAPER: |f| of a hit's sample, no bound */
     dist_stats *stats;
 } dist_images;

@@ -3335,7 +3335,7 @@ static void disti_spans(const float *s, const float *square, int n, const float 
 
 /* The farthest end of the spans that begin at `end` or before, at least `end`; *next: where the first of the others
    begins, 3e38 without one. n is a multiple of 4. */
-static float disti_spans_end(const float *from, const float *to, int n, float end, float *next)
+static float disti_spans_farthest(const float *from, const float *to, int n, float end, float *next)
 {
     float most = end, least = 3e38f;
     int k = 0;
@@ -3357,6 +3357,17 @@ static float disti_spans_end(const float *from, const float *to, int n, float en
     }
     *next = least;
     return most;
+}
+
+/* Where spans end that join `end` or each other. */
+static float disti_spans_end(const float *from, const float *to, int n, float end, float *next)
+{
+    float far = disti_spans_farthest(from, to, n, end, next);
+    while (far > end) {
+        end = far;
+        far = disti_spans_farthest(from, to, n, end, next);
+    }
+    return end;
 }
 
 /*@ 04 field -------------------------------------------------------------------------------------------------------- */
@@ -5712,12 +5723,10 @@ static void disti_encode(const dist_net *net, const disti_kernels *kernels, size
     for (size_t c = 0; c < DISTI_BLOCK && n < DISTI_BLOCK; c++)
         memcpy(last + 3 * c, points + 3 * (c < n ? c : n - 1), 3 * sizeof(float));
     if (n < DISTI_BLOCK) points = last;
-    if (net->raw) kernels->rows(points, rows);
-    if (net->levels == 0) return;
-    float x[3 * DISTI_BLOCK];
+    float own[3 * DISTI_BLOCK], *x = net->raw ? rows : own;
     kernels->rows(points, x);
     size_t stride = (size_t)(net->order == DISTI_ORDER_SIN_COS ? 6 : 3) * DISTI_BLOCK;
-    for (int axis = 0; axis < 3; axis++)
+    for (int axis = 0; axis < 3 && net->levels > 0; axis++)
         kernels->angles(net->base, net->levels, x + axis * DISTI_BLOCK, stride,
                         rows + (size_t)disti_encoding_row(net, 0, axis, 0) * DISTI_BLOCK,
                         rows + (size_t)disti_encoding_row(net, 0, axis, 1) * DISTI_BLOCK);
@@ -9029,9 +9038,10 @@ static float disti_ray_floor(const disti_tracer *tracer, const disti_ray *ray)
 static void disti_ray_creeps(const disti_tracer *tracer, disti_ray *ray, float f, int trusted)
 {
     float ripple = 10.0f * disti_default_epsilon(tracer);
+    if (tracer->how.certified) return;
     int skips = ray->mode == DISTI_SKIP && f < disti_ray_near(tracer, ray, ray->q);
     if (skips || (trusted && f < ripple && ray->slope > -0.3f * tracer->lipschitz)) {
-        if (ray->fcrept > 0.0f || tracer->how.certified) return;
+        if (ray->fcrept > 0.0f) return;
         ray->crept = ray->s;
         ray->fcrept = ray->f;
     } else if (f >= ripple) {
@@ -9559,12 +9569,13 @@ static void disti_ray_point(const disti_ray *ray, float s, float p[3])
 }
 
 /* From now on rays look this far, and none has looked yet: the covers' places are free again. */
-static void disti_balls_look(disti_balls *balls, int stride, int window)
+static void disti_balls_look(const disti_bench *bench, int stride, int window)
 {
+    disti_balls *balls = bench->balls;
     balls->stride = stride;
     balls->window = window;
     balls->covers = 0;
-    memset(balls->cover_of, 0, sizeof balls->cover_of);
+    memset(balls->cover_of, 0, (size_t)(bench->width * bench->height) * sizeof *balls->cover_of);
 }
 
 /* Adds [from, to] to the parts beyond the end; where all places are taken the farthest gives way. */
@@ -9667,20 +9678,10 @@ static void disti_cover_begin(const disti_bench *bench, int index, const disti_r
             n += count;
         }
     }
-    float begin = cover->end, end, far = begin;
-    do {
-        end = far;
-        far = disti_spans_end(from, to, n, end, &next);
-    } while (far > end);
-    cover->end = end;
+    cover->end = disti_spans_end(from, to, n, cover->end, &next);
     for (cover->count = 0; cover->count < DISTI_COVERS && next < 3e38f; cover->count++) {
-        begin = far = next;
-        do {
-            end = far;
-            far = disti_spans_end(from, to, n, end, &next);
-        } while (far > end);
-        cover->from[cover->count] = begin;
-        cover->to[cover->count] = end;
+        cover->from[cover->count] = next;
+        cover->to[cover->count] = disti_spans_end(from, to, n, next, &next);
     }
 }
 
@@ -10648,8 +10649,8 @@ static void disti_lattice_balls(const disti_tracer *tracer, const disti_tile *ti
     bench->height = tile->height;
     bench->least = 0.4f * disti_pixel_width(tracer, tile);
     bench->balls->clears = 0;
-    memset(bench->balls->reach, 0, sizeof bench->balls->reach);
-    disti_balls_look(bench->balls, DISTI_LATTICE, 3);
+    memset(bench->balls->reach, 0, (size_t)(bench->width * bench->height));
+    disti_balls_look(bench, DISTI_LATTICE, 3);
 }
 
 static void disti_trace_lattice(const disti_tracer *tracer, int worker, const disti_tile *tile, disti_bench *bench)
@@ -10680,7 +10681,7 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
     if (tile->cheap && tile->normals) bench->gradient = (float *)(void *)bench->rest; /* the cones are done with */
     for (int h = DISTI_LATTICE / 2; h > 0; h /= 2) {
         for (int pass = 1; pass <= 2; pass++) { /* between two known pixels, then amid four */
-            if (bench->balls) disti_balls_look(bench->balls, h, DISTI_MIN(h + 3, 6));
+            if (bench->balls) disti_balls_look(bench, h, DISTI_MIN(h + 3, 6));
             for (int y = pass == 1 ? 0 : h; y < tile->height; y += pass == 1 ? h : 2 * h) {
                 for (int x = pass == 1 && y & h ? 0 : h; x < tile->width; x += 2 * h) {
                     int index = y * tile->width + x;

@@ -600,10 +600,11 @@ TEST(spans_are_what_spheres_cover_of_another_line)
             CHECK((from[k] > 2e38f) == (off > (double)square[k]) || fabs(off - (double)square[k]) < 1e-6);
         }
         float next, first = 3e38f, most = -0.4f, end = disti_spans_end(from, to, COUNT, -0.4f, &next);
-        for (int k = 0; k < COUNT; k++) {
-            if (from[k] <= -0.4f && to[k] > most) most = to[k];
-            if (from[k] > -0.4f && from[k] < first) first = from[k];
-        }
+        for (int pass = 0; pass < COUNT; pass++)
+            for (int k = 0; k < COUNT; k++)
+                if (from[k] <= most && to[k] > most) most = to[k];
+        for (int k = 0; k < COUNT; k++)
+            if (from[k] > most && from[k] < first) first = from[k];
         CHECK_NEAR((double)most, end, 0);
         CHECK_NEAR((double)first, next, 0);
     }

@@ -175,7 +175,7 @@ csv work_precision sweep $how --at-once $at_once && {
     echo "Defaults only, $table_size x $table_size pixels: the error of the distance, against a reference in double, that"
     echo "99 % of the hits keep (wrong pixels of the mask; queries a pixel). Every other measure and the times are in the csv,"
     echo "a scene's sweeps of epsilon, alpha, budget and K in work_precision_SCENE.csv. n/a: this processor has no such"
-    echo "arithmetic, or the field is no network; empty: left out for its time ($(sed -n 's/^in all: //p' "$folder/work_precision.txt"))."
+    echo "arithmetic, or the field is no network; empty: its time was up (in all $(sed -n 's/^in all: //p' "$folder/work_precision.txt"))."
     echo "[work_precision.txt](work_precision.txt): where bounds are violated, where a row of the paper's tracer is cheaper"
     echo "or more exact, what was left out."
     echo

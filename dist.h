@@ -484,8 +484,9 @@ enum {
 typedef struct dist_render_desc {
     int max_steps;       /* queries per ray at most; 0: 100 guarded, 1000 certified, 50 paper */
     float step_scale;    /* alpha; 0: 1.5 (paper: rows aggressive and coarse-to-fine). Above 0 */
-    float epsilon; /* largest |f| of a hit, shape units; 0: 5e-5 of the bounding radius or field.detail, or less where a
-                      pixel is smaller (paper: 5e-5). The guarded tracer takes at most half of field.clamp */
+    float epsilon; /* largest |f| of a hit, shape units, which those interpolated between hits alike may exceed; 0: 5e-5
+                      of the bounding radius or field.detail, or less where a pixel is smaller (paper: 5e-5). The
+                      guarded tracer takes at most half of field.clamp */
     int samples;         /* K of the paper's gradient, 1 to 8; 0: 1 */
     int trace;           /* DIST_TRACE_* */
     int paper_row;       /* DIST_PAPER_* */
@@ -9021,14 +9022,14 @@ static int disti_ray_open_bracket(const disti_tracer *tracer, disti_ray *ray, fl
     return disti_ray_bracket(tracer, ray);
 }
 
-/* Steps no shorter than this are taken along a surface that the ray hardly approaches: half a pixel, so that what a
-   chord cuts off is a small part of one. They grow from the 20th query on, so that a plateau of f ends within the
-   budget. */
+/* Steps no shorter than this are taken along a surface that the ray hardly approaches: a pixel or .003 of the radius,
+   so that what a chord cuts off is a small part of one. They grow from the 20th query on, so that a plateau of f ends
+   within the budget. */
 static float disti_ray_floor(const disti_tracer *tracer, const disti_ray *ray)
 {
     if (tracer->how.certified) return 0.0f;
     float patience = ray->steps > 20 ? 1.0f + 0.1f * (float)(ray->steps - 20) : 1.0f;
-    float pixel = (float)(ray->base + (double)ray->s) * ray->footprint, radius = tracer->field->radius;
+    float pixel = 2.0f * (float)(ray->base + (double)ray->s) * ray->footprint, radius = tracer->field->radius;
     return patience * DISTI_MAX(5e-4f * radius, DISTI_MIN(pixel, 3e-3f * radius));
 }
 
@@ -10504,16 +10505,37 @@ static float disti_depth_beside(const float *depth, int at, int end, int shift, 
 typedef struct disti_guess {
     float depth, slope;
     int quality; /* 3: by four hits alike, 2: good, 1: but the slope is anyone's guess, -1: beyond an edge, 0: none */
-    float off;   /* how far the prediction was from the neighbors; 0: unknown */
+    float off;   /* how far it may be off by what the neighbors were; 0: unknown */
+    float seen;  /* how far the neighbors' own predictions were off */
     float spread; /* of the neighbors' slopes, relative to their mean */
     float differ; /* of the cubics along the two axes */
     float sag;   /* how far the cubic is from the line */
 } disti_guess;
 
+/* What neighbors at (at - h, beside) and (at + h, beside) say of how far a cubic is off here. Each was predicted from
+   pixels farther apart, at its `level`, the lowest bit of its coordinates: on a smooth surface the error grows with the
+   fourth power of that distance, at a crease amid the four with the distance itself, so theirs counts h / level times.
+   For pixels of the lattice, which were not predicted, the other neighbor speaks. */
+static void disti_guess_off(disti_guess *guess, const disti_ray *before, const disti_ray *behind, int at, int beside,
+                            int h)
+{
+    int level1 = ((at - h) | beside) % DISTI_LATTICE, level2 = ((at + h) | beside) % DISTI_LATTICE;
+    float off1 = before->off, off2 = behind->off;
+    if (before->kept || behind->kept) { /* predicted by the last picture, not by neighbors */
+        level1 = level2 = h;
+    } else {
+        if (level1 == 0) off1 = off2, level1 = level2;
+        if (level2 == 0) off2 = off1, level2 = level1;
+    }
+    if (!(off1 > 0.0f && off2 > 0.0f) || level1 == 0) return;
+    guess->seen = DISTI_MAX(off1, off2);
+    guess->off = (float)h * DISTI_MAX(off1 / (float)(level1 & -level1), off2 / (float)(level2 & -level2));
+}
+
 /* Prediction along one axis of the picture from the hits at -3 h, -h, h, 3 h. Across an edge, where the hits at -h and
    h are a step apart, it is the farther surface, in case that the ray passes the nearer. */
 static disti_guess disti_predict_axis(const disti_tracer *tracer, const disti_ray *ray, const float *depth, int at,
-                                      int end, int h, int stride)
+                                      int beside, int end, int h, int stride)
 {
     disti_guess guess;
     memset(&guess, 0, sizeof guess);
@@ -10545,8 +10567,7 @@ static disti_guess disti_predict_axis(const disti_tracer *tracer, const disti_ra
         float line = 1.0f / inverse;
         inverse = (9.0f / z1 + 9.0f / z2 - 1.0f / a - 1.0f / b) * 0.0625f;
         guess.sag = line * inverse < 1.0f ? 1.0f / inverse - line : line - 1.0f / inverse;
-        float off1 = ray[-h * stride].off, off2 = ray[h * stride].off;
-        if (off1 > 0.0f && off2 > 0.0f) guess.off = DISTI_MAX(off1, off2);
+        disti_guess_off(&guess, &ray[-h * stride], &ray[h * stride], at, beside, h);
         guess.quality += guess.quality == 2;
     }
     guess.depth = 1.0f / inverse;
@@ -10554,8 +10575,8 @@ static disti_guess disti_predict_axis(const disti_tracer *tracer, const disti_ra
 }
 
 /* Sets up pixel (x, y) for its first query, half way between pixels at distance h known along x, y or both. 0: it
-   needs none: between four hits alike which were themselves predicted to within half of epsilon, or to within two where
-   those along x and along y say the same, it is interpolated. */
+   needs none: between four hits alike that foretell it to within half of epsilon, or to within two where those along x
+   and along y say the same, it is interpolated. */
 static int disti_predict(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench, int x, int y,
                           int h)
 {
@@ -10563,15 +10584,16 @@ static int disti_predict(const disti_tracer *tracer, const disti_tile *tile, con
     float *depth = &bench->depth[y * tile->width + x];
     int odd_x = x & h, odd_y = y & h;
     disti_guess guess, other;
-    guess = disti_predict_axis(tracer, ray, depth, odd_x ? x : y, odd_x ? tile->width : tile->height, h,
+    guess = disti_predict_axis(tracer, ray, depth, odd_x ? x : y, odd_x ? y : x, odd_x ? tile->width : tile->height, h,
                                odd_x ? 1 : tile->width);
     if (odd_x && odd_y) {
-        other = disti_predict_axis(tracer, ray, depth, y, tile->height, h, tile->width);
+        other = disti_predict_axis(tracer, ray, depth, y, x, tile->height, h, tile->width);
         if (guess.quality > 0 && other.quality > 0) {
             guess.differ = guess.depth < other.depth ? other.depth - guess.depth : guess.depth - other.depth;
             guess.depth = 0.5f * (guess.depth + other.depth);
             guess.slope = 0.5f * (guess.slope + other.slope);
             guess.off = guess.off > 0.0f && other.off > 0.0f ? DISTI_MAX(guess.off, other.off) : 0.0f;
+            guess.seen = DISTI_MAX(guess.seen, other.seen);
             guess.sag = DISTI_MAX(guess.sag, other.sag);
             guess.spread = DISTI_MAX(guess.spread, other.spread);
             guess.quality = DISTI_MIN(guess.quality, other.quality);
@@ -10598,7 +10620,7 @@ static int disti_predict(const disti_tracer *tracer, const disti_tile *tile, con
             ray->slope = guess.slope;
             ray->off = guess.off;
             /* at a crease amid the four, where the cubic is off by up to three times what it differs from the line */
-            float error = guess.off + epsilon + 2.0f * guess.sag / ray->cosine;
+            float error = guess.seen + epsilon + 2.0f * guess.sag / ray->cosine;
             disti_ray_end(ray, DIST_RAY_HIT, s, 0.0f, 2.0f * error);
             *depth = disti_hit_depth(ray);
             return 0;

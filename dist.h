@@ -9293,7 +9293,8 @@ static int disti_ray_predicted(const disti_tracer *tracer, disti_ray *ray, float
     if (first && fronted && f > 0.0f) before = 0.5f * ray->f; /* the front's: it fell, or it ends elsewhere */
     int good = slope < -0.12f * tracer->lipschitz && length < 0.03f * tracer->field->radius && magnitude < before &&
                ray->side < 5;
-    if (good && (!foreign || ray->width > 0.0f) && length <= (foreign ? ray->width : 12.0f) * epsilon) {
+    int steep = f < epsilon || slope < -0.3f * tracer->lipschitz; /* else f may flatten out before it is 0 */
+    if (good && steep && (!foreign || ray->width > 0.0f) && length <= (foreign ? ray->width : 12.0f) * epsilon) {
         float off = ray->q + step - ray->target;
         ray->slope = slope;
         if (length > 0.125f * (float)(ray->base + (double)ray->q) * ray->footprint) ray->own = 0; /* of a pixel: 1/16 */
@@ -10521,7 +10522,7 @@ static void disti_guess_off(disti_guess *guess, const disti_ray *before, const d
 {
     int level1 = ((at - h) | beside) % DISTI_LATTICE, level2 = ((at + h) | beside) % DISTI_LATTICE;
     float off1 = before->off, off2 = behind->off;
-    if (before->kept || behind->kept) { /* predicted by the last picture, not by neighbors */
+    if (before->kept || behind->kept) { /* warm: predicted by the last picture, or from next to it */
         level1 = level2 = h;
     } else {
         if (level1 == 0) off1 = off2, level1 = level2;

@@ -1591,6 +1591,66 @@ TEST(steps_that_may_have_gone_through_something_are_taken_back)
     dist_context_destroy(ctx);
 }
 
+/* Pixels of the lattice of 8 were not predicted, (4, y) from 4 pixels away, (2, y) and (6, y) from 2, all others from
+   next to them. */
+TEST(what_neighbors_were_off_counts_by_the_distance_they_were_predicted_from)
+{
+    disti_ray before, behind;
+    disti_guess guess;
+    memset(&before, 0, sizeof before);
+    memset(&behind, 0, sizeof behind);
+    memset(&guess, 0, sizeof guess);
+    before.off = 3e-4f;
+    disti_guess_off(&guess, &before, &behind, 3, 2, 1);
+    CHECK(!(guess.off > 0)); /* nothing is known of (4, 2), so nothing of (3, 2) */
+    behind.off = 8e-4f;
+    disti_guess_off(&guess, &before, &behind, 3, 0, 1); /* (2, 0) from 2, (4, 0) from 4 pixels away */
+    CHECK_NEAR(2e-4, guess.off, 1e-9);
+    CHECK_NEAR(8e-4, guess.seen, 1e-9);
+    disti_guess_off(&guess, &before, &behind, 6, 0, 2); /* (4, 0); (8, 0) is of the lattice, whatever its ray says */
+    CHECK_NEAR(1.5e-4, guess.off, 1e-9);
+    CHECK_NEAR(3e-4, guess.seen, 1e-9);
+    disti_guess_off(&guess, &before, &behind, 17, 24, 1); /* (16, 24) is of it, too; (18, 24) speaks for both */
+    CHECK_NEAR(4e-4, guess.off, 1e-9);
+    disti_guess_off(&guess, &before, &behind, 5, 7, 1); /* (4, 7) and (6, 7): from next to them */
+    CHECK_NEAR(8e-4, guess.off, 1e-9);
+    behind.kept = 1;
+    disti_guess_off(&guess, &before, &behind, 3, 0, 1); /* a warm start's */
+    CHECK_NEAR(8e-4, guess.off, 1e-9);
+    memset(&guess, 0, sizeof guess);
+    behind.kept = 0;
+    disti_guess_off(&guess, &before, &behind, 4, 0, 4); /* both of the lattice */
+    CHECK(!(guess.off > 0) && !(guess.seen > 0));
+}
+
+/* A step of Newton's along a slope of a quarter from a positive sample ends a ray only if the sample is within epsilon;
+   along a steeper one it may be as far off as twelve of them. */
+TEST(flat_rays_end_at_samples_within_epsilon)
+{
+    dist_context *ctx = shape_context();
+    test_shape shape = shape_make(SHAPE_TORUS, 0.6, 0.25, 0, 0);
+    dist_field field = shape_field(&shape, 1, 1);
+    dist_render_desc how = plain_how();
+    how.epsilon = 1e-4f;
+    for (int k = 0; k < 8; k++) {
+        disti_tracer tracer;
+        disti_ray ray;
+        float slope = k & 1 ? -0.25f : -0.5f, f = k & 2 ? 2.5e-4f : 9e-5f, sign = k & 4 ? -1.0f : 1.0f;
+        CHECK_STATUS(DIST_OK, disti_tracer_init(&tracer, ctx, &field, &how, "test"), ctx);
+        memset(&ray, 0, sizeof ray);
+        ray.sign = 1;
+        ray.base = 2;
+        ray.leave = 0.5f;
+        ray.f = 0.01f;
+        ray.s = -0.02f;
+        ray.a = -3e-3f;
+        ray.fa = sign * f - 3e-3f * slope; /* the slope of the last two samples */
+        CHECK_EQUAL(k == 3 ? 1 : 0, disti_ray_predicted(&tracer, &ray, sign * f));
+        CHECK(k == 3 || ray.status == DIST_RAY_HIT);
+    }
+    dist_context_destroy(ctx);
+}
+
 /* Against rays that step by at most f / 2.5. */
 TEST(the_default_tracer_loses_one_hit_in_ten_thousand_of_the_embedded_family)
 {
@@ -1801,6 +1861,8 @@ int main(int argc, char **argv)
     RUN(bounds_reach_to_where_f_was_foretold_to_cross_and_over_what_is_flat);
     RUN(tiles_that_cost_most_last_time_come_first_and_change_nothing);
     RUN(steps_that_may_have_gone_through_something_are_taken_back);
+    RUN(what_neighbors_were_off_counts_by_the_distance_they_were_predicted_from);
+    RUN(flat_rays_end_at_samples_within_epsilon);
     RUN(the_default_tracer_loses_one_hit_in_ten_thousand_of_the_embedded_family);
     RUN(error_bounds_hold_for_999_hits_of_1000);
     RUN(error_bounds_hold_for_999_hits_of_1000_of_real_decoders);

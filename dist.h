@@ -9022,8 +9022,8 @@ static int disti_ray_open_bracket(const disti_tracer *tracer, disti_ray *ray, fl
     return disti_ray_bracket(tracer, ray);
 }
 
-/* Steps no shorter than this are taken along a surface that the ray hardly approaches: a pixel or .003 of the radius,
-   so that what a chord cuts off is a small part of one. They grow from the 20th query on, so that a plateau of f ends
+/* Steps no shorter than this are taken along a surface that the ray hardly approaches: a pixel, from .0005 to .003 of
+   the radius, so that what a chord cuts off is a small part of one. They grow from the 20th query on, so that a plateau of f ends
    within the budget. */
 static float disti_ray_floor(const disti_tracer *tracer, const disti_ray *ray)
 {
@@ -9293,8 +9293,8 @@ static int disti_ray_predicted(const disti_tracer *tracer, disti_ray *ray, float
     if (first && fronted && f > 0.0f) before = 0.5f * ray->f; /* the front's: it fell, or it ends elsewhere */
     int good = slope < -0.12f * tracer->lipschitz && length < 0.03f * tracer->field->radius && magnitude < before &&
                ray->side < 5;
-    int steep = f < epsilon || slope < -0.3f * tracer->lipschitz; /* else f may flatten out before it is 0 */
-    if (good && steep && (!foreign || ray->width > 0.0f) && length <= (foreign ? ray->width : 12.0f) * epsilon) {
+    int ends = f < epsilon || slope < -0.3f * tracer->lipschitz; /* else f may flatten out before it is 0 */
+    if (good && ends && (!foreign || ray->width > 0.0f) && length <= (foreign ? ray->width : 12.0f) * epsilon) {
         float off = ray->q + step - ray->target;
         ray->slope = slope;
         if (length > 0.125f * (float)(ray->base + (double)ray->q) * ray->footprint) ray->own = 0; /* of a pixel: 1/16 */

@@ -1624,7 +1624,7 @@ TEST(what_neighbors_were_off_counts_by_the_distance_they_were_predicted_from)
 }
 
 /* A step of Newton's along a slope of a quarter from a positive sample ends a ray only if the sample is within epsilon;
-   along a steeper one it may be as far off as twelve of them. */
+   along a steeper one the step may be twelve of them long. */
 TEST(flat_rays_end_at_samples_within_epsilon)
 {
     dist_context *ctx = shape_context();

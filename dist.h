@@ -9023,8 +9023,8 @@ static int disti_ray_open_bracket(const disti_tracer *tracer, disti_ray *ray, fl
 }
 
 /* Steps no shorter than this are taken along a surface that the ray hardly approaches: a pixel, from .0005 to .003 of
-   the radius, so that what a chord cuts off is a small part of one. They grow from the 20th query on, so that a plateau of f ends
-   within the budget. */
+   the radius, so that what a chord cuts off is a small part of one. They grow from the 20th query on, so that a plateau
+   of f ends within the budget. */
 static float disti_ray_floor(const disti_tracer *tracer, const disti_ray *ray)
 {
     if (tracer->how.certified) return 0.0f;

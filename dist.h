@@ -8982,21 +8982,30 @@ static int disti_ray_bracketed(const disti_tracer *tracer, disti_ray *ray, float
     return disti_ray_bracket(tracer, ray);
 }
 
-/* Whether no surface but the one that f crosses between a and b, fa > 0 >= fb, fits in there: how much of it is beyond
-   the empty spheres at its ends is no more than `most` of the radius, nothing if certified. */
-static int disti_ray_alone(const disti_tracer *tracer, float a, float fa, float b, float fb, float most)
+/* How much of the bracket [a, b], fa > 0 >= fb, is beyond the empty spheres at its ends: room for other surfaces than
+   the one that f crosses. */
+static float disti_ray_room(const disti_tracer *tracer, float a, float fa, float b, float fb)
 {
-    float room = tracer->how.certified ? 4.8e-7f : most;
-    return b - a - disti_empty(tracer, fa) - disti_empty(tracer, -fb) <= room * tracer->field->radius;
+    return b - a - disti_empty(tracer, fa) - disti_empty(tracer, -fb);
+}
+
+/* Whether that is no more than `most` of the radius; certified: than epsilon, which then is the hit's error. */
+static int disti_ray_alone(const disti_tracer *tracer, const disti_ray *ray, float a, float fa, float b, float fb,
+                           float most)
+{
+    float room = tracer->how.certified ? disti_ray_epsilon(tracer, ray, ray->s) : most * tracer->field->radius;
+    return disti_ray_room(tracer, a, fa, b, fb) <= room;
 }
 
 /* How far before the end of a bracket [a, b] f may have crossed 0: the slope before it foretells a crossing at
    a + fa / -slope, and where f falls by less than 0.6 of that slope (chosen, not derived) it has bent on the way, above
-   0 or below. Certified steps allow no crossing before a, and none in a bracket but where the budget was spent or the
-   Lipschitz figure wrong. */
+   0 or below. Certified steps allow no crossing before a, and in the bracket none but in its room. */
 static float disti_ray_bent(const disti_tracer *tracer, const disti_ray *ray, float a, float fa, float b, float fb)
 {
-    if (tracer->how.certified) return disti_ray_alone(tracer, a, fa, b, fb, 0.0f) ? 0.0f : b - a;
+    if (tracer->how.certified) {
+        float room = disti_ray_room(tracer, a, fa, b, fb);
+        return room > 4.8e-7f * tracer->field->radius ? room : 0.0f;
+    }
     if (!ray->known || -0.6f * ray->slope * (b - a) <= fa - fb) return 0.0f;
     return b - a + fa / ray->slope;
 }
@@ -9019,6 +9028,13 @@ static int disti_ray_open_bracket(const disti_tracer *tracer, disti_ray *ray, fl
     ray->width = b - a;
     ray->incline = (fb - fa) / (b - a);
     ray->side = 0;
+    float room = disti_ray_room(tracer, a, fa, b, fb);
+    if (tracer->how.certified && room > 0.0f && room <= disti_ray_epsilon(tracer, ray, a)) {
+        float near = a + disti_empty(tracer, fa), q = a + (b - a) * (fa / (fa - fb));
+        ray->slope = ray->incline;
+        return disti_ray_end(ray, DIST_RAY_HIT, DISTI_MIN(DISTI_MAX(q, near), near + room), 0.0f,
+                             DISTI_MAX(room, disti_ray_kink(tracer, ray, -ray->incline)));
+    }
     return disti_ray_bracket(tracer, ray);
 }
 
@@ -9050,34 +9066,42 @@ static void disti_ray_creeps(const disti_tracer *tracer, disti_ray *ray, float f
     }
 }
 
-/* Where to look next from the front: near the surface a jump to where the last slope says that f ends, at most three
-   spheres or a hundredth of the radius far, but nothing proves it: not if certified, and not before a sample that lies
-   in a solid, where what is proven counts; else a sphere step, stretched by what the slope allows: for a plane that
-   recedes or comes at the angle seen, 2 / (1 - slope) (auto-relaxation), somewhat less as the slope changes. What is
-   found there is checked on arrival. */
+/* A step to where f ends if it falls like that (above 0), at most three spheres or a hundredth of the
+   radius far; 0: none is taken. Nothing proves it, so not before a sample that lies in a solid, where what is proven
+   counts; a certified ray takes it as soon as the spheres at its two ends leave no more than epsilon between them. */
+static float disti_ray_jump(const disti_tracer *tracer, const disti_ray *ray, float falls, float radius)
+{
+    int solid = ray->fb < 0.0f, certified = tracer->how.certified;
+    float epsilon = certified ? disti_ray_epsilon(tracer, ray, ray->s) : disti_ray_near(tracer, ray, ray->s);
+    float jump = ray->f / falls, beyond = 1.03f * jump + 0.5f * epsilon;
+    if (certified) return jump - radius <= 0.4f * epsilon && !(solid && ray->s + beyond >= ray->b) ? beyond : 0.0f;
+    float cap = 3.0f * radius + epsilon;
+    if (solid || beyond <= cap) return solid ? 0.0f : beyond;
+    /* short of the end: f must still be positive there, or something came in between */
+    if (ray->f < 5e-3f * tracer->field->radius) cap = DISTI_MAX(cap, 1e-2f * tracer->field->radius);
+    return DISTI_MIN(0.97f * jump, cap);
+}
+
+/* Where to look next from the front: near the surface a jump to where the last slope says that f ends, else a sphere
+   step, stretched by what the slope allows: for a plane that recedes or comes at the angle seen, 2 / (1 - slope)
+   (auto-relaxation), somewhat less as the slope changes. What is found there is checked on arrival; so a certified ray
+   may begin with the slope that its neighbors' hits foretell. */
 static int disti_ray_step(const disti_tracer *tracer, disti_ray *ray)
 {
     float radius = disti_empty(tracer, ray->f);
-    float epsilon = disti_ray_near(tracer, ray, ray->s);
-    float slope = ray->slope / tracer->lipschitz;
+    int certified = tracer->how.certified, told = certified && !ray->known && ray->incline < 0.0f;
+    float slope = (told ? ray->incline : ray->slope) / tracer->lipschitz;
     if (ray->fb < 0.0f && ray->s + radius >= ray->b) /* not Lipschitz after all */
         return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->b, ray->fb);
     if (ray->s + radius >= ray->leave)
         return disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest * ray->sign, 0.0f);
-    float relaxed = (tracer->how.certified ? 1.95f : 1.8f) / (1.0f - DISTI_MIN(slope, 0.75f));
-    float stretch = !ray->known ? tracer->how.step_scale : DISTI_MAX(1.0f, relaxed);
-    float step = radius * DISTI_MIN(stretch, 8.0f);
-    int mode = DISTI_MARCH;
-    int leaps = ray->known && !tracer->how.certified && !(ray->fb < 0.0f);
-    if (leaps && slope < -0.05f && ray->f < 0.05f * tracer->field->radius) {
-        float jump = ray->f / -ray->slope, cap = 3.0f * radius + epsilon;
-        step = 1.03f * jump + 0.5f * epsilon;
-        if (step > cap) { /* short of the end: f must still be positive there, or something came in between */
-            if (ray->f < 5e-3f * tracer->field->radius) cap = DISTI_MAX(cap, 1e-2f * tracer->field->radius);
-            step = DISTI_MIN(0.97f * jump, cap);
-        }
-        mode = DISTI_JUMP;
-    }
+    float relaxed = (certified ? 1.95f : 1.8f) / (1.0f - DISTI_MIN(slope, 0.75f));
+    float stretch = ray->known || told ? DISTI_MAX(1.0f, relaxed) : tracer->how.step_scale;
+    float step = radius * DISTI_MIN(stretch, 8.0f), jump = 0.0f;
+    if ((ray->known || told) && slope < -0.05f && ray->f < 0.05f * tracer->field->radius)
+        jump = disti_ray_jump(tracer, ray, told ? -ray->incline : -ray->slope, radius);
+    int mode = jump > 0.0f ? DISTI_JUMP : DISTI_MARCH;
+    if (jump > 0.0f) step = jump;
     if (ray->known && slope > -0.3f) { /* but not through a surface that the slope foretells */
         float floor = disti_ray_floor(tracer, ray);
         if (slope < 0.0f) floor = DISTI_MIN(floor, 0.9f * ray->f / -ray->slope);
@@ -9368,13 +9392,14 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
         float radius = disti_empty(tracer, ray->f), step = q - ray->s;
         float spacing = 4.8e-7f * tracer->field->radius;
         if (ray->fb < 0.0f && f > 0.0f && q < ray->b && ++ray->side >= 3 && !tracer->how.certified &&
-            (ray->side >= 8 || disti_ray_alone(tracer, q, f, ray->b, ray->fb, 2e-3f)))
+            (ray->side >= 8 || disti_ray_alone(tracer, ray, q, f, ray->b, ray->fb, 2e-3f)))
             return disti_ray_open_bracket(tracer, ray, q, f, ray->b, ray->fb);
         float gap = step - radius - disti_empty(tracer, f < 0.0f ? -f : f); /* what neither sphere covers */
         int back = ray->mode != DISTI_SKIP && step > 1.0001f * radius + spacing;
         float off = f - (ray->f + ray->slope * step);
         int foretold = ray->known && (off < 0.0f ? -off : off) < 0.5f * (off - f); /* as deep as expected */
-        float room = tracer->how.certified ? 0.0f : (foretold ? 2e-2f : 1e-3f) * tracer->field->radius;
+        float room = (foretold ? 2e-2f : 1e-3f) * tracer->field->radius;
+        if (tracer->how.certified) room = disti_ray_epsilon(tracer, ray, ray->s);
         if (f <= 0.0f && !(back && gap > room))
             return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, q, f);
         if (back && (f <= 0.0f || (gap > 0.0f && !disti_ray_trusts(tracer, ray, f, step)))) {
@@ -9401,7 +9426,7 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
         disti_ray_creeps(tracer, ray, f, back && gap > 0.0f);
         if (ray->fb < 0.0f) { /* a crossing lies before b: is there room for another before it? */
             if (ray->b <= q) return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->b, ray->fb);
-            if (disti_ray_alone(tracer, q, f, ray->b, ray->fb, 1e-3f))
+            if (disti_ray_alone(tracer, ray, q, f, ray->b, ray->fb, 1e-3f))
                 return disti_ray_open_bracket(tracer, ray, q, f, ray->b, ray->fb);
         }
         ray->a = ray->s;
@@ -9426,7 +9451,7 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
     }
     if (ray->f < disti_ray_near(tracer, ray, ray->s)) {
         if (ray->fb < 0.0f && ray->b > ray->s) { /* what is near need not be what is at b */
-            if (!disti_ray_alone(tracer, ray->s, ray->f, ray->b, ray->fb, 2e-3f)) return disti_ray_step(tracer, ray);
+            if (!disti_ray_alone(tracer, ray, ray->s, ray->f, ray->b, ray->fb, 2e-3f)) return disti_ray_step(tracer, ray);
             return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->b, ray->fb);
         }
         float epsilon = disti_ray_near(tracer, ray, ray->s);
@@ -10605,6 +10630,10 @@ static int disti_predict(const disti_tracer *tracer, const disti_tile *tile, con
     }
     ray->mode = DISTI_FIRST;
     ray->q = ray->start;
+    if (tracer->how.certified) {
+        ray->incline = guess.quality > 0 ? guess.slope : 0.0f;
+        return 1;
+    }
     if (guess.quality == 0 || !(guess.slope < -0.12f * tracer->lipschitz)) return 1;
     float s = (float)((double)(guess.depth / ray->cosine) - ray->base);
     float epsilon = disti_ray_epsilon(tracer, ray, s);
@@ -11142,7 +11171,9 @@ static void disti_paper_finish(const disti_tracer *tracer, disti_ray *ray)
     else if (before && ray->fa <= epsilon && first) ray->status = DIST_RAY_HIT;
     else if (before && !first && ray->a < 0.0f) ray->status = DIST_RAY_INSIDE;
     else if (before) ray->status = DIST_RAY_UNRESOLVED;
-    int behind = ray->status == DIST_RAY_HIT && ray->base + (double)ray->best < 0.0; /* f < 0 at first: it went back */
+    double distance = ray->base + (double)ray->best;
+    int hit = ray->status == DIST_RAY_HIT, behind = hit && distance < -(double)tracer->noise; /* f < 0 at first: back */
+    if (hit && !behind && distance < 0.0) ray->best = (float)-ray->base; /* rounded off from at the camera */
     if (behind || ray->status == DIST_RAY_INSIDE) {
         disti_ray_end(ray, DIST_RAY_INSIDE, ray->enter, ray->a, 0.0f);
         return;
@@ -11760,6 +11791,14 @@ static int disti_warm_reaches(const disti_warm *warm, int i)
     return ray->start + ray->guard / warm->tracer->lipschitz >= warm->tape->start[disti_warm_pixel(warm, i)];
 }
 
+/* Whether f crossed 0 at the ray's last hit by falling, not all but flat, nor by a step, as where a solid that goes on
+   beyond its bounding sphere is cut off: that does not move with what is around it. */
+static int disti_warm_falls(const disti_warm *warm, size_t pixel)
+{
+    float slope = warm->tape->value[pixel], lipschitz = warm->tracer->lipschitz;
+    return slope < -2e-3f * lipschitz && slope > -4.0f * lipschitz;
+}
+
 /* Whether the ray may be looked for near its last hit s. */
 static int disti_warm_expects(const disti_warm *warm, int i, float s)
 {
@@ -11767,7 +11806,7 @@ static int disti_warm_expects(const disti_warm *warm, int i, float s)
     const disti_ray *ray = &warm->bench->rays[i];
     float slope = warm->tape->value[pixel];
     if (warm->open[i] != 1 || ray->mode == DISTI_DONE || (warm->tape->status[pixel] & 15) != DIST_RAY_HIT) return 0;
-    if (!(slope < -2e-3f * warm->tracer->lipschitz) || !(s > ray->enter && s < ray->leave)) return 0;
+    if (!disti_warm_falls(warm, pixel) || !(s > ray->enter && s < ray->leave)) return 0;
     if (ray->guard > 2e38f) return 0; /* no cone came here */
     return -slope * (s - ray->start) <= ray->guard || disti_warm_reaches(warm, i);
 }
@@ -11917,7 +11956,7 @@ static void disti_warm_hits(disti_warm *warm, int pass)
         if (pass == 0 ? (x | y) & 7 : disti_warm_asks(warm, x, y) == (pass == 2)) continue;
         size_t pixel = disti_warm_pixel(warm, i);
         float spread = 3e38f, wide = 3e38f, s = warm->tape->s[pixel], move = 0.0f;
-        if (!(warm->tape->value[pixel] < -2e-3f * warm->tracer->lipschitz)) continue; /* as disti_warm_expects */
+        if (!disti_warm_falls(warm, pixel)) continue; /* as disti_warm_expects */
         for (int slopes = 0; slopes < 2 && pass > 0; slopes++) { /* the one by which the neighbors differ less */
             float apart = 3e38f, *least = &spread, other = 3e38f;
             if (pass == 2) other = disti_warm_between(warm, warm->moved, slopes, i, &apart);

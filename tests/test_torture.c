@@ -778,10 +778,11 @@ static void judge_truth(const scene *s, const planes *p, const scene_field *own)
         double epsilon = s->how.epsilon > 0 ? (double)s->how.epsilon : 5e-5 * (paper ? 1 : s->radius);
         epsilon = fmax(epsilon, 5e-7 * s->radius);
         int wild = own->wild == WILD_HASH || own->wild == WILD_SPIKES;
+        double small = epsilon * (paper ? 1 + slope : 1.01) + 2 * slope * rounding, m = 0;
         if (p->status[i] == DIST_RAY_HIT && !coarse && !wild) {
             double e = (double)p->error[i] + rounding;
-            double a = value_at(own, o, d, t - e), m = value_at(own, o, d, t), b = value_at(own, o, d, t + e);
-            double small = epsilon * (paper ? 1 + slope : 1.01) + 2 * slope * rounding;
+            double a = value_at(own, o, d, t - e), b = value_at(own, o, d, t + e);
+            m = value_at(own, o, d, t);
             hits_judged++;
             int good = (a > 0) != (b > 0) || fabs(m) <= small || comes_near(own, o, d, t - e, t + e, slope, small, &m);
             /* power -1: a float is off along a grazing ray by many times its own */
@@ -795,7 +796,8 @@ static void judge_truth(const scene *s, const planes *p, const scene_field *own)
             hits_judged++;
             if (f > 4 * slope * rounding) note(FALSE_HIT, "inside, f", f, rounding);
         }
-        if (p->status[i] != DIST_RAY_MISS && p->status[i] != DIST_RAY_UNRESOLVED) continue;
+        int proven = s->how.certified && p->status[i] == DIST_RAY_HIT; /* the first one that there is */
+        if (p->status[i] != DIST_RAY_MISS && p->status[i] != DIST_RAY_UNRESOLVED && !proven) continue;
         if (!s->sane || paper || own->code[0] != 0 || !meets) continue;
         double q[3] = {c[0] / s->radius, c[1] / s->radius, c[2] / s->radius};
         double bumps = own->shape.kind == SHAPE_BUMPY ? 3 : 1;
@@ -810,9 +812,12 @@ static void judge_truth(const scene *s, const planes *p, const scene_field *own)
                 shallow_misses++;
         } else {
             bounds_judged++;
-            double e = (double)p->error[i] + 4 * rounding;
-            if (fabs(x.t * s->radius - t) > e)
-                note(BAD_BOUND, "off, error", fabs(x.t * s->radius - t), (double)p->error[i]);
+            double e = (double)p->error[i] + 4 * rounding, off = x.t * s->radius - t;
+            if (proven && off > 0) continue; /* a thin sheet's, or an outline's */
+            if (off < -e && !s->how.certified)
+                shallow_misses++;
+            else if (fabs(off) > e && !comes_near(own, o, d, t - e, t + e, slope, small, &m)) /* or a thin sheet's */
+                note(BAD_BOUND, "off, error", fabs(off), (double)p->error[i]);
         }
     }
 }

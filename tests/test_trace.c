@@ -343,6 +343,77 @@ TEST(no_sheet_before_a_solid_is_passed)
     dist_context_destroy(ctx);
 }
 
+/* A wire over a slope, both seen at a low angle. */
+typedef struct test_wire {
+    double radius, at[3], along[3], up[3]; /* a point of it and its unit direction; normal of the slope through 0 */
+} test_wire;
+
+static double wire_value(const test_wire *wire, const double p[3], int *on_wire)
+{
+    double e[3], slope = 0, along = 0, square = 0;
+    for (int k = 0; k < 3; k++) {
+        e[k] = p[k] - wire->at[k];
+        slope += wire->up[k] * p[k];
+        along += wire->along[k] * e[k];
+    }
+    for (int k = 0; k < 3; k++) square += (e[k] - along * wire->along[k]) * (e[k] - along * wire->along[k]);
+    double near = sqrt(square) - wire->radius;
+    *on_wire = near < slope;
+    return fmin(near, slope);
+}
+
+static void wire_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    const test_wire *wire = (const test_wire *)user;
+    (void)worker;
+    (void)gradient; /* not asked for */
+    for (size_t i = 0; i < n; i++) {
+        double p[3] = {(double)points[3 * i], (double)points[3 * i + 1], (double)points[3 * i + 2]};
+        int on_wire;
+        sdf[i] = (float)wire_value(wire, p, &on_wire);
+    }
+}
+
+/* What the neighbors' hits foretell lies behind it: a certified ray may not go there but by steps that are proven. */
+TEST(no_wire_before_a_surface_is_passed_by_certified_pictures)
+{
+    dist_context *ctx = shape_context();
+    const float eye[3] = {0, 0.35f, 2.2f}, middle[3] = {0, 0, 0}, up[3] = {0, 1, 0};
+    dist_camera camera = dist_camera_look_at(WIDE, WIDE, 1.0f, eye, middle, up);
+    int seen = 0, passed[2] = {0, 0};
+    for (int k = 0; k < 16; k++) {
+        test_wire wire = {6e-4, {3e-3 * k, 0.02 + 0.03 * k, 0.25}, {0.8, 0, 0.6}, {0, cos(0.02), sin(0.02)}};
+        dist_field field;
+        memset(&field, 0, sizeof field);
+        field.user = &wire;
+        field.eval_fn = wire_eval;
+        field.radius = field.lipschitz = 1;
+        for (int certified = 0; certified < 2; certified++) {
+            dist_render_desc how = plain_how();
+            how.certified = certified;
+            CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, &how, &picture_a), ctx);
+            for (int i = 0; i < WIDE * WIDE; i++) {
+                float o[3], d[3];
+                double p[3], t = 1.2, f = 1;
+                int on_wire = 0;
+                dist_camera_ray(&camera, (float)(i % WIDE), (float)(i / WIDE), o, d);
+                for (int step = 0; step < 5000 && f > -1e-6 && t < 3.3; step++, t += fmax(f, 1e-6)) {
+                    for (int j = 0; j < 3; j++) p[j] = (double)o[j] + t * (double)d[j];
+                    f = wire_value(&wire, p, &on_wire);
+                }
+                if (f > -1e-6 || !on_wire || p[0] * p[0] + p[1] * p[1] + p[2] * p[2] > 0.95) continue;
+                seen += certified;
+                passed[certified] += !picture_a.mask[i] || (double)picture_a.distance[i] > t + 0.01;
+            }
+        }
+    }
+    if (test_state.verbose) printf("    of %d pixels of wires passed: %d, certified %d\n", seen, passed[0], passed[1]);
+    CHECK(seen > 300);
+    CHECK_EQUAL(0, passed[1]);
+    CHECK(passed[0] * 20 <= seen);
+    dist_context_destroy(ctx);
+}
+
 /* Up to six boxes, plates, rods and balls together, turned any way: rounded boxes. */
 typedef struct test_parts {
     int count;
@@ -1419,16 +1490,16 @@ TEST(bounds_reach_to_where_f_was_foretold_to_cross_and_over_what_is_flat)
         CHECK(disti_ray_open_bracket(&tracer, &ray, 0, 5.211e-3f, 2.34e-2f, -5e-7f));
         CHECK_EQUAL(0, disti_ray_bracketed(&tracer, &ray, -1.3e-6f));
         CHECK_EQUAL(DIST_RAY_HIT, ray.status);
-        CHECK(ray.error > (certified ? 2.3e-2f : 9.3e-3f)); /* was 2e-5; such a bracket is not proven to be empty */
+        CHECK(ray.error > (certified ? 1.8e-2f : 9.3e-3f)); /* was 2e-5; so much of it is not proven to be empty */
     }
     tracer.how.certified = 1;
-    CHECK(disti_ray_open_bracket(&tracer, &ray, 0, 5.211e-3f, 5.2115e-3f, -5e-7f)); /* but this is */
-    CHECK_EQUAL(0, disti_ray_bracketed(&tracer, &ray, 5.211e-3f - ray.q));
-    CHECK(ray.error < 1e-5f);
-    CHECK(disti_ray_alone(&tracer, 0, 0.1f, 0.5f, -0.5f, 0));
+    CHECK_EQUAL(0, disti_ray_open_bracket(&tracer, &ray, 0, 5.211e-3f, 5.23e-3f, -5e-7f)); /* but all this, bar 2e-5 */
+    CHECK_EQUAL(DIST_RAY_HIT, ray.status);
+    CHECK(ray.best > 5.21e-3f && ray.best < 5.23e-3f && ray.error > 1.84e-5f && ray.error < 1.86e-5f);
+    CHECK(disti_ray_alone(&tracer, &ray, 0, 0.1f, 0.5f, -0.5f, 0));
     tracer.far = 0.1f; /* twice as steep where |f| is larger: 0.5 is at least 0.3 deep, not 0.5 */
     tracer.ratio = 0.5f;
-    CHECK(!disti_ray_alone(&tracer, 0, 0.1f, 0.5f, -0.5f, 0));
+    CHECK(!disti_ray_alone(&tracer, &ray, 0, 0.1f, 0.5f, -0.5f, 0));
     CHECK_STATUS(DIST_OK, disti_tracer_init(&tracer, ctx, &field, NULL, "test"), ctx);
     memset(&ray, 0, sizeof ray);
     ray.sign = 1;
@@ -1831,6 +1902,7 @@ int main(int argc, char **argv)
     RUN(no_rod_thinner_than_a_pixel_is_missed);
     RUN(certified_rays_miss_nothing);
     RUN(no_sheet_before_a_solid_is_passed);
+    RUN(no_wire_before_a_surface_is_passed_by_certified_pictures);
     RUN(one_hit_in_a_thousand_is_lost_of_random_thin_parts_and_none_certified);
     RUN(lipschitz_far_holds_where_f_is_large);
     RUN(cones_change_no_pixel);

@@ -504,8 +504,9 @@ typedef struct dist_render_desc {
                          without a mask; 0: off */
     int no_cones;        /* 1: every ray marches from the bounding sphere by itself */
     int no_prediction;   /* 1: no ray starts from what its neighbors found */
-    int certified;       /* 1: only steps that the Lipschitz figures prove; nothing is missed where these are bounds:
-                            a net's are sampled, dist_stats.steepest says when they were too small */
+    int certified;       /* 1: only steps that the Lipschitz figures prove, for two to four times the queries; nothing
+                            is missed, nor seen by more than epsilon too far away, where these are bounds: a net's are
+                            sampled, dist_stats.steepest says when they were too small */
     /* dist_trace only. any_hit 1: a ray ends as soon as anything is certain to block it, for shadows; its distance is
        then that of a sample inside what blocks, its error how far before that it goes in. max_distance: how far a ray
        looks, in lengths of its direction (1: from origin to origin + direction); 0: without end */
@@ -9028,12 +9029,11 @@ static int disti_ray_open_bracket(const disti_tracer *tracer, disti_ray *ray, fl
     ray->width = b - a;
     ray->incline = (fb - fa) / (b - a);
     ray->side = 0;
-    float room = disti_ray_room(tracer, a, fa, b, fb);
-    if (tracer->how.certified && room > 0.0f && room <= disti_ray_epsilon(tracer, ray, a)) {
-        float near = a + disti_empty(tracer, fa), q = a + (b - a) * (fa / (fa - fb));
+    float epsilon = disti_ray_epsilon(tracer, ray, a);
+    if (tracer->how.certified && b > a && b - a <= 2.0f * epsilon && fa > fb && !disti_coarse(tracer, epsilon)) {
         ray->slope = ray->incline;
-        return disti_ray_end(ray, DIST_RAY_HIT, DISTI_MIN(DISTI_MAX(q, near), near + room), 0.0f,
-                             DISTI_MAX(room, disti_ray_kink(tracer, ray, -ray->incline)));
+        float error = DISTI_MAX(b - a, disti_ray_kink(tracer, ray, -ray->incline));
+        return disti_ray_end(ray, DIST_RAY_HIT, a + (b - a) * (fa / (fa - fb)), 0.0f, error);
     }
     return disti_ray_bracket(tracer, ray);
 }
@@ -9066,9 +9066,9 @@ static void disti_ray_creeps(const disti_tracer *tracer, disti_ray *ray, float f
     }
 }
 
-/* A step to where f ends if it falls like that (above 0), at most three spheres or a hundredth of the
-   radius far; 0: none is taken. Nothing proves it, so not before a sample that lies in a solid, where what is proven
-   counts; a certified ray takes it as soon as the spheres at its two ends leave no more than epsilon between them. */
+/* A step to where f ends if it falls like that (above 0), at most three spheres or a hundredth of the radius far; 0:
+   none is taken. Nothing proves it, so not before a sample that lies in a solid, where what is proven counts; a
+   certified ray takes it as soon as the spheres at its two ends leave no more than epsilon between them. */
 static float disti_ray_jump(const disti_tracer *tracer, const disti_ray *ray, float falls, float radius)
 {
     int solid = ray->fb < 0.0f, certified = tracer->how.certified;
@@ -9451,7 +9451,8 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
     }
     if (ray->f < disti_ray_near(tracer, ray, ray->s)) {
         if (ray->fb < 0.0f && ray->b > ray->s) { /* what is near need not be what is at b */
-            if (!disti_ray_alone(tracer, ray, ray->s, ray->f, ray->b, ray->fb, 2e-3f)) return disti_ray_step(tracer, ray);
+            if (!disti_ray_alone(tracer, ray, ray->s, ray->f, ray->b, ray->fb, 2e-3f))
+                return disti_ray_step(tracer, ray);
             return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->b, ray->fb);
         }
         float epsilon = disti_ray_near(tracer, ray, ray->s);
@@ -11171,9 +11172,7 @@ static void disti_paper_finish(const disti_tracer *tracer, disti_ray *ray)
     else if (before && ray->fa <= epsilon && first) ray->status = DIST_RAY_HIT;
     else if (before && !first && ray->a < 0.0f) ray->status = DIST_RAY_INSIDE;
     else if (before) ray->status = DIST_RAY_UNRESOLVED;
-    double distance = ray->base + (double)ray->best;
-    int hit = ray->status == DIST_RAY_HIT, behind = hit && distance < -(double)tracer->noise; /* f < 0 at first: back */
-    if (hit && !behind && distance < 0.0) ray->best = (float)-ray->base; /* rounded off from at the camera */
+    int behind = ray->status == DIST_RAY_HIT && ray->base + (double)ray->best < -(double)tracer->noise; /* it went back */
     if (behind || ray->status == DIST_RAY_INSIDE) {
         disti_ray_end(ray, DIST_RAY_INSIDE, ray->enter, ray->a, 0.0f);
         return;
@@ -11181,7 +11180,8 @@ static void disti_paper_finish(const disti_tracer *tracer, disti_ray *ray)
     ray->error = before && ray->status == DIST_RAY_UNRESOLVED
                      ? DISTI_MAX(ray->leave - ray->best, ray->best - ray->enter) /* steps may have gone too far */
                      : magnitude;
-    if (ray->status == DIST_RAY_HIT) ray->best += disti_clamp(f, 0.1f * tracer->field->radius);
+    if (ray->status == DIST_RAY_HIT) /* at the camera at least, whatever rounding did */
+        ray->best = DISTI_MAX(ray->best + disti_clamp(f, 0.1f * tracer->field->radius), (float)-ray->base);
 }
 
 /* Traces one tile. samples (rays, how.samples, 4) may be NULL; it is written for every ray. */

@@ -608,7 +608,7 @@ static void judge_hits(const scene *s, dist_context *ctx, const dist_field *fiel
         const float *g = slope + 3 * (at + 1);
         double rounding = 3e-7 * (fabs((double)p->distance[i]) + (double)field->radius + center);
         double small = 1.01 * epsilon + rounding * (1 + shape_length((double)g[0], (double)g[1], (double)g[2]));
-        int crossed = (f[at] > 0) != (f[at + 2] > 0);
+        int crossed = (f[at] > 0) != (f[at + 1] > 0) || (f[at + 1] > 0) != (f[at + 2] > 0);
         hits_judged++;
         if (!crossed && !(fabs((double)f[at + 1]) <= small))
             note(FALSE_HIT, "of the field, f, error", (double)f[at + 1], (double)p->error[i]);
@@ -915,16 +915,18 @@ TEST(random_scenes_keep_their_word)
     const unsigned long kept[7] = {1005801, 1005855, 1011869, 50009703, 50010779, 1009082, 900016283};
     for (int i = 0; i < 7 && !only; i++) one_scene(kept[i], 0);
     /* of those with all that was added: idle lanes counted as alive units, a hit's silhouette without a sample of f, a
-       texture that overflows, a first sample of the paper's tracer that is not finite, warm hits that owe nothing */
-    const unsigned long kept_too[5] = {988, 20823, 40869, 7538, 16137};
-    for (int i = 0; i < 5 && !only; i++) one_scene(kept_too[i], 1);
+       texture that overflows, a first sample of the paper's tracer that is not finite, warm hits that owe nothing, a
+       certified picture between bumps that it foretold (last but two), hits of the paper's tracer at the camera itself,
+       warm hits where a bounding sphere cuts a solid off */
+    const unsigned long kept_too[8] = {988, 20823, 40869, 7538, 16137, 7001159, 7001548, 7014988};
+    for (int i = 0; i < 8 && !only; i++) one_scene(kept_too[i], 1);
     for (int k = 0; k < FAULTS; k++) {
         CHECK_EQUAL(0, found[k]);
         if (getenv("DIST_TORTURE")) printf("scenes,%s,0,%ld\n", fault_names[k], found[k]);
     }
     /* Without how.certified a jump along a low surface may pass a crossing that is shallower than it looked. */
     CHECK(shallow_misses * 2000 <= hits_judged + 4000);
-    CHECK(unlike_hits * 10000 <= hits_judged + 40000);
+    CHECK(unlike_hits * 5000 <= hits_judged + 20000);
     CHECK_EQUAL(expected_refusals, refusals);
     for (int k = 0; k < WITHS && !only; k++) {
         CHECK(with[k] > 0 || k == WITH_HALF || count < 200);

@@ -1493,9 +1493,13 @@ TEST(bounds_reach_to_where_f_was_foretold_to_cross_and_over_what_is_flat)
         CHECK(ray.error > (certified ? 1.8e-2f : 9.3e-3f)); /* was 2e-5; so much of it is not proven to be empty */
     }
     tracer.how.certified = 1;
-    CHECK_EQUAL(0, disti_ray_open_bracket(&tracer, &ray, 0, 5.211e-3f, 5.23e-3f, -5e-7f)); /* but all this, bar 2e-5 */
+    CHECK(disti_ray_open_bracket(&tracer, &ray, 0, 5.211e-3f, 5.2115e-3f, -5e-7f)); /* but this is */
+    CHECK_EQUAL(0, disti_ray_bracketed(&tracer, &ray, 5.211e-3f - ray.q));
+    CHECK(ray.error < 1e-5f);
+    CHECK_EQUAL(0, disti_ray_open_bracket(&tracer, &ray, 0, 3e-5f, 9e-5f, -3e-5f)); /* as short as two epsilons */
     CHECK_EQUAL(DIST_RAY_HIT, ray.status);
-    CHECK(ray.best > 5.21e-3f && ray.best < 5.23e-3f && ray.error > 1.84e-5f && ray.error < 1.86e-5f);
+    CHECK_NEAR(4.5e-5, ray.best, 1e-9);
+    CHECK_NEAR(9e-5, ray.error, 1e-9);
     CHECK(disti_ray_alone(&tracer, &ray, 0, 0.1f, 0.5f, -0.5f, 0));
     tracer.far = 0.1f; /* twice as steep where |f| is larger: 0.5 is at least 0.3 deep, not 0.5 */
     tracer.ratio = 0.5f;

@@ -11172,7 +11172,8 @@ static void disti_paper_finish(const disti_tracer *tracer, disti_ray *ray)
     else if (before && ray->fa <= epsilon && first) ray->status = DIST_RAY_HIT;
     else if (before && !first && ray->a < 0.0f) ray->status = DIST_RAY_INSIDE;
     else if (before) ray->status = DIST_RAY_UNRESOLVED;
-    int behind = ray->status == DIST_RAY_HIT && ray->base + (double)ray->best < -(double)tracer->noise; /* it went back */
+    /* behind the camera by more than rounding: f < 0 at first, so it went back */
+    int hit = ray->status == DIST_RAY_HIT, behind = hit && ray->base + (double)ray->best < -(double)tracer->noise;
     if (behind || ray->status == DIST_RAY_INSIDE) {
         disti_ray_end(ray, DIST_RAY_INSIDE, ray->enter, ray->a, 0.0f);
         return;
@@ -11180,8 +11181,7 @@ static void disti_paper_finish(const disti_tracer *tracer, disti_ray *ray)
     ray->error = before && ray->status == DIST_RAY_UNRESOLVED
                      ? DISTI_MAX(ray->leave - ray->best, ray->best - ray->enter) /* steps may have gone too far */
                      : magnitude;
-    if (ray->status == DIST_RAY_HIT) /* at the camera at least, whatever rounding did */
-        ray->best = DISTI_MAX(ray->best + disti_clamp(f, 0.1f * tracer->field->radius), (float)-ray->base);
+    if (hit) ray->best = DISTI_MAX(ray->best + disti_clamp(f, 0.1f * tracer->field->radius), (float)-ray->base);
 }
 
 /* Traces one tile. samples (rays, how.samples, 4) may be NULL; it is written for every ray. */

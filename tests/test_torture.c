@@ -584,6 +584,14 @@ static dist_status scene_backward(const scene *s, dist_context *ctx, const dist_
     return status;
 }
 
+/* How many bumps pass from one pixel to the next at a distance. More than one in two: what neighbors see is not alike,
+   and warm hits that are moved as these are may be late (dist_tape_create). */
+static double bumps_per_pixel(const scene *s, double t)
+{
+    double focal = fmin(fabs((double)s->camera.fx), fabs((double)s->camera.fy));
+    return s->own.shape.kind == SHAPE_BUMPY ? t / focal * s->own.shape.n[2] / s->radius / 6.283185307 : 0;
+}
+
 /* Hits of ordinary nets, and of instances, by what the field itself says there in float: small, or of another sign
    within the error; but not where that reaches to another surface. */
 static void judge_hits(const scene *s, dist_context *ctx, const dist_field *field, const planes *p)
@@ -610,8 +618,10 @@ static void judge_hits(const scene *s, dist_context *ctx, const dist_field *fiel
         double small = 1.01 * epsilon + rounding * (1 + shape_length((double)g[0], (double)g[1], (double)g[2]));
         int crossed = (f[at] > 0) != (f[at + 1] > 0) || (f[at + 1] > 0) != (f[at + 2] > 0);
         hits_judged++;
-        if (!crossed && !(fabs((double)f[at + 1]) <= small))
-            note(FALSE_HIT, "of the field, f, error", (double)f[at + 1], (double)p->error[i]);
+        if (!crossed && !(fabs((double)f[at + 1]) <= small)) {
+            if (s->warm && bumps_per_pixel(s, (double)p->distance[i]) > 0.5) unlike_hits++;
+            else note(FALSE_HIT, "of the field, f, error", (double)f[at + 1], (double)p->error[i]);
+        }
         at += 3;
     }
 }
@@ -735,24 +745,17 @@ static double value_at(const scene_field *f, const double o[3], const double d[3
     return scene_value(f, p);
 }
 
-/* Whether |f| is at most `small` somewhere between t0 and t1: by steps that the slope allows. */
+/* Whether |f| is at most `small` somewhere between t0 and t1, or f crosses 0: by steps that the slope allows. */
 static int comes_near(const scene_field *f, const double o[3], const double d[3], double t0, double t1, double slope,
                       double small, double *m)
 {
-    for (int k = 0; k < 20000 && t0 <= t1; k++) {
+    for (int k = 0, side = 0; k < 20000 && t0 <= t1; k++) {
         *m = value_at(f, o, d, t0);
-        if (fabs(*m) <= small) return 1;
+        if (fabs(*m) <= small || side * *m < 0) return 1;
+        side = *m > 0 ? 1 : -1;
         t0 += (fabs(*m) - 0.5 * small) / slope;
     }
     return t0 <= t1; /* undecided */
-}
-
-/* How many bumps pass from one pixel to the next at a distance. More than one in two: what neighbors see is not alike,
-   and warm hits that are moved as these are may be late (dist_tape_create). */
-static double bumps_per_pixel(const scene *s, double t)
-{
-    double focal = fmin(fabs((double)s->camera.fx), fabs((double)s->camera.fy));
-    return s->own.shape.kind == SHAPE_BUMPY ? t / focal * s->own.shape.n[2] / s->radius / 6.283185307 : 0;
 }
 
 /* Hits: f is small there, or changes sign within the error. The surface's slope is known, so f small is judged by it.

@@ -504,7 +504,7 @@ typedef struct dist_render_desc {
                          without a mask; 0: off */
     int no_cones;        /* 1: every ray marches from the bounding sphere by itself */
     int no_prediction;   /* 1: no ray starts from what its neighbors found */
-    int certified;       /* 1: only steps that the Lipschitz figures prove, for two to four times the queries; nothing
+    int certified;       /* 1: only steps that the Lipschitz figures prove, for up to five times the queries; nothing
                             is missed, nor seen by more than epsilon too far away, where these are bounds: a net's are
                             sampled, dist_stats.steepest says when they were too small */
     /* dist_trace only. any_hit 1: a ray ends as soon as anything is certain to block it, for shadows; its distance is

@@ -8990,7 +8990,7 @@ static float disti_ray_room(const disti_tracer *tracer, float a, float fa, float
     return b - a - disti_empty(tracer, fa) - disti_empty(tracer, -fb);
 }
 
-/* Whether that is no more than `most` of the radius; certified: than epsilon, which then is the hit's error. */
+/* Whether that is no more than `most` of the radius; certified: than epsilon, and so near the hit is the first one. */
 static int disti_ray_alone(const disti_tracer *tracer, const disti_ray *ray, float a, float fa, float b, float fb,
                            float most)
 {

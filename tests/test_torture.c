@@ -820,7 +820,7 @@ static void judge_truth(const scene *s, const planes *p, const scene_field *own)
                 shallow_misses++;
             else if (off < -e) /* certified, and what it found lies behind that */
                 note(FALSE_MISS, "passed, by", x.t, -off);
-            else if (off > e && !proven && !comes_near(own, o, d, t - e, t + e, slope, small, &m)) /* nor a thin sheet */
+            else if (off > e && !proven && !comes_near(own, o, d, t - e, t + e, slope, small, &m)) /* no sheet */
                 note(BAD_BOUND, "off, error", off, (double)p->error[i]);
         }
     }

@@ -10799,7 +10799,8 @@ static void disti_trace_doubt(const disti_tracer *tracer, const disti_tile *tile
 enum { DISTI_ASIDE = 3 }; /* pixels that a surface is moved by, at most */
 
 /* The same where f is off by coarse_error, which moves the surface aside, too: by coarse_error / slope, seen as so many
-   pixels. The exact depth is then among those met within them, or, at an outline, up to as far again behind. On an even
+   pixels. The exact depth is then among those met within them (a step in depth: or a little behind), or, at an outline,
+   up to as far again behind, and no nearer than at an angle at which f falls by a quarter of its slope. On an even
    surface less than a pixel moves it by as much less; the slope is taken as a quarter of that expected, as that is
    where f is worse than its Lipschitz figure says. */
 static void disti_coarse_doubt(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench)
@@ -10824,8 +10825,9 @@ static void disti_coarse_doubt(const disti_tracer *tracer, const disti_tile *til
             far = DISTI_MAX(far, other - z);
         }
         float doubt = DISTI_MAX(near, far);
-        if (outline) doubt *= 1.5f;
-        else if (doubt <= 2.0f * (DISTI_MIN(near, far) + pixel)) doubt *= DISTI_MIN(1.0f, 4.0f * pixels);
+        int even = doubt <= 2.0f * (DISTI_MIN(near, far) + pixel);
+        if (outline) doubt = DISTI_MAX(1.5f * doubt, 4.0f * moved);
+        else doubt *= even ? DISTI_MIN(1.0f, 4.0f * pixels) : 1.05f;
         ray->error = DISTI_MAX(ray->error, doubt / ray->cosine);
     }
 }
@@ -11734,11 +11736,12 @@ static void disti_tile_trim(const disti_render_job *job, disti_tile *tile, const
    may have brought it near, f is asked for where it was least, and when it is near, by samples on both sides how low it
    is now: a crossing is bracketed on the spot, what stays undecided is marched.
    What has a nearer hit beside it, not of the same slant, may be covered by that: from the nearer one's distance on,
-   the least f is looked for likewise, again when the bound found is used up; misses take turns at it.
+   the least f is looked for likewise, again when the bound found is used up; misses take turns at it, and hits while
+   the picture moves little.
    Rays that start inside do so until the change of f may have brought them out.
    All is off for rays where f at the cones' stop is too small for the surface expected (as in disti_predict) and the
    cones prove less to be empty than when the ray was traced, for tiles where the first pixels contradict what is
-   expected, and around those of the pixels marched anew (one hit in 128 each turn) that do. */
+   expected, and around those of the pixels marched anew (one hit in 128 each turn, down to one in 512) that do. */
 enum { DISTI_WARM_HITS = 128, DISTI_WARM_MISSES = 64, DISTI_WARM_MINIMA = 8 };
 
 /* What a ray is asked for: a step of Newton's, how f has changed where it was least, whether that is still a miss (the
@@ -11768,6 +11771,7 @@ typedef struct disti_warm {
     unsigned char *ask;   /* DISTI_ASK_* */
     float change, mean;   /* largest change of f in the tile, no less than its mean over the picture */
     float typical;        /* mean change of f at every 8th hit */
+    unsigned calm;        /* disti_warm_calm */
     int due, late;        /* all least |f| are looked for anew; neighbors are known as far as they will be */
     size_t count, awaited; /* of bench->index; of these, with the first three DISTI_ASK_* */
 } disti_warm;
@@ -11777,11 +11781,22 @@ static size_t disti_warm_pixel(const disti_warm *warm, int i)
     return disti_tile_pixel(warm->tile, i);
 }
 
-/* Whether it is the pixel's turn to be marched anew: one of each 8 x 16 block (period 128), scattered. */
+/* How much rarer than after `period` turns pixels are marched anew, 1 to 4: what may come up unseen grows with what the
+   picture moves. */
+static unsigned disti_warm_calm(float change, float radius)
+{
+    unsigned calm = 1;
+    while (calm < 4 && (float)(2 * calm * DISTI_WARM_HITS) * change <= 0.1f * radius) calm *= 2;
+    return calm;
+}
+
+/* Whether it is the pixel's turn to be marched anew: one of each 8 x 16 block (period 128), scattered, up to one of each
+   16 x 32. */
 static int disti_warm_due(const disti_warm *warm, int i, unsigned period)
 {
     unsigned x = (unsigned)(i % warm->tile->width), y = (unsigned)(i / warm->tile->width);
-    return ((x % 8u + y % 16u * 8u) * 27u + warm->tape->turn) % period == 0;
+    unsigned place = x % 8u + y % 16u * 8u + x / 8u % 2u * 128u + y / 16u % 2u * 256u;
+    return (place * 27u + warm->tape->turn) % (period * warm->calm) == 0;
 }
 
 /* Whether the cones prove the ray empty as far as when it was traced, with the last sphere beyond their stop. */
@@ -11984,7 +11999,7 @@ static void disti_warm_hits(disti_warm *warm, int pass)
     }
 }
 
-/* Whether most of the `tried` first hits were found, and f has changed little there. */
+/* Whether half of the `tried` first hits were found, and f has changed little there. */
 static int disti_warm_good(disti_warm *warm, size_t tried)
 {
     size_t good = 0;
@@ -11996,7 +12011,7 @@ static int disti_warm_good(disti_warm *warm, size_t tried)
         good++;
     }
     warm->typical = good > 0 ? sum / (float)good : 0.0f;
-    return 4 * good >= 3 * tried && warm->typical <= 8e-3f * warm->tracer->field->radius;
+    return 2 * good >= tried && warm->typical <= 8e-3f * warm->tracer->field->radius;
 }
 
 /* Whether it is the tile's turn to have all of its least |f| looked for anew, in 2 to 8 turns: before the picture has
@@ -12181,8 +12196,9 @@ static int disti_warm_beside(disti_warm *warm, int i, int fresh)
     if (fresh) *bound = DISTI_MAX(*bound - loss, 0.0f);
     if (*bound > 0.5f * loss + disti_ray_epsilon(warm->tracer, ray, s)) return 0;
     int hit = warm->moved[i] < 2e38f && s < ray->best, miss = ray->status == DIST_RAY_MISS && ray->kept;
-    miss &= (i % warm->tile->width + i / warm->tile->width + (int)(warm->tape->turn & 1u)) & 1;
-    if (!warm->open[i] || ray->mode != DISTI_DONE || !(hit || miss) || s <= ray->start || s >= ray->leave) return 0;
+    int turn = (i % warm->tile->width + i / warm->tile->width + (int)(warm->tape->turn & 1u)) & 1;
+    if (!(hit || miss) || !(turn || (hit && warm->calm == 1))) return 0;
+    if (!warm->open[i] || ray->mode != DISTI_DONE || s <= ray->start || s >= ray->leave) return 0;
     ray->q = s;
     ray->f = 3e38f;
     ray->moved = 1;
@@ -12198,7 +12214,7 @@ static int disti_warm_least(disti_warm *warm, int i, float f)
     float epsilon = disti_ray_epsilon(warm->tracer, ray, ray->best), radius = warm->tracer->field->radius;
     float margin = 5.0f * (warm->change + epsilon), value = warm->tape->value[disti_warm_pixel(warm, i)];
     int odd = (i + i / warm->tile->width + (int)warm->tape->turn) & 1;
-    int still = !warm->silhouette && warm->change < 5e-4f * radius && odd && value > 0.0f && f > 3.0f * epsilon;
+    int still = !warm->silhouette && warm->change < 1e-3f * radius && odd && value > 0.0f && f > 3.0f * epsilon;
     if (!(warm->silhouette && value > 0.0f)) margin += 0.03f * radius; /* the bound is used up: a new one */
     ray->f = f;
     ray->s = ray->best;
@@ -12379,6 +12395,7 @@ static void disti_render_warm(const disti_render_job *job, int worker, const dis
     warm.n = tile->width * tile->height;
     warm.silhouette = job->least;
     warm.change = warm.mean = job->change;
+    warm.calm = disti_warm_calm(job->change, job->tracer->field->radius);
     warm.due = warm.silhouette && disti_warm_minima_due(&warm, warm.mean);
     warm.moved = (float *)(void *)bench->rest;
     warm.drift = warm.moved + warm.n;

@@ -275,15 +275,16 @@ TEST(nets_that_move_by_half_a_thousandth_cost_1_2_queries_a_hit_and_do_not_drift
 
 TEST(trained_nets_of_the_test_data_do_not_drift_either)
 {
-    check_steps("fox", 0, 4e-4f, 0, test_quick() ? 20 : 100, 1.2);
+    check_steps("fox", 0, 5e-4f, 0, test_quick() ? 20 : 100, 1.1);
     if (test_quick()) return;
     check_steps("fox", 0, 2e-3f, 0, 40, 2.0);
-    check_steps("fox", 0, 5e-4f, 1, 40, 1.9);
-    check_steps("bob_spot", 1, 5e-4f, 0, 40, 1.0);
+    check_steps("fox", 0, 5e-4f, 1, 40, 1.7);
+    check_steps("bob_spot", 1, 5e-4f, 0, 40, 0.9);
     check_steps("bob_spot", 1, 4e-4f, 1, 40, 1.2);
-    check_steps("bunny_relu", 0, 5e-4f, 0, 40, 1.2);
-    check_steps("rings", 0, 4e-4f, 0, 40, 1.35);
-    check_steps("mug_camera_bottle", 0, 4e-4f, 0, 40, 2.0);
+    check_steps("bunny_relu", 0, 5e-4f, 0, 40, 1.0);
+    check_steps("rings", 0, 5e-4f, 0, 40, 1.2);
+    check_steps("mug_camera_bottle", 0, 4e-4f, 0, 40, 1.7);
+    check_steps("mug_camera_bottle", 0, 1e-3f, 0, 40, 3.0); /* half of a tile is not where it was expected */
 }
 
 /* What neighbors moved by may be an old error of theirs that they mended. */

@@ -616,7 +616,8 @@ typedef struct dist_tape dist_tape;
    within its error bound, but those without a query, moved as their neighbors are and asked within 16 renders, only
    where neighbors see alike: not where the surface has bumps finer than two pixels. Between the cones' stop and the
    hit a surface that comes out of nothing is noticed at once if f where the cones stop betrays it, else by the rays
-   that are marched anew in turn: after 128 renders at the latest (64 for pixels that were misses). */
+   that are marched anew in turn: after 128 renders at the latest (64 for pixels that were misses), or, while hits move
+   by 0.1 of the radius or less meanwhile, after 512 (256); and hits around such a ray's new one, one render later. */
 DIST_API dist_tape *dist_tape_create(dist_context *ctx, const dist_camera *camera, const dist_render_desc *desc);
 DIST_API void dist_tape_destroy(dist_tape *tape);
 
@@ -11790,8 +11791,8 @@ static unsigned disti_warm_calm(float change, float radius)
     return calm;
 }
 
-/* Whether it is the pixel's turn to be marched anew: one of each 8 x 16 block (period 128), scattered, up to one of each
-   16 x 32. */
+/* Whether it is the pixel's turn to be marched anew: one of each 8 x 16 block (period 128), scattered, up to one of
+   each 16 x 32; no later than that where `calm` changes meanwhile. */
 static int disti_warm_due(const disti_warm *warm, int i, unsigned period)
 {
     unsigned x = (unsigned)(i % warm->tile->width), y = (unsigned)(i / warm->tile->width);
@@ -12185,7 +12186,8 @@ static void disti_warm_misses(disti_warm *warm)
 
 /* What lies beside another surface, hits that have a nearer one beside them and misses, may be covered by that: spheres
    from its distance on until f rises again or is what the hit alone makes it; what they get close to is looked at.
-   1: ray i is to be asked. fresh: for the first time this turn. */
+   1: ray i is to be asked, misses every second turn, and hits too while the picture is calm. fresh: for the first time
+   this turn. */
 static int disti_warm_beside(disti_warm *warm, int i, int fresh)
 {
     disti_ray *ray = &warm->bench->rays[i];

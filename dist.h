@@ -11098,9 +11098,9 @@ static void disti_paper_step(const disti_tracer *tracer, disti_ray *ray, float *
     if (samples) disti_paper_keep(samples, tracer->how.samples, f, p);
     if (ray->steps == 0) ray->a = f;
     if (ray->steps == 0 || magnitude < ray->fa) ray->fa = magnitude;
-    if (!disti_finite(f)) ray->moved = 1;
     ray->f = f;
-    ray->s += alpha * disti_clamp(f, 0.1f * tracer->field->radius);
+    if (disti_finite(f)) ray->s += alpha * disti_clamp(f, 0.1f * tracer->field->radius);
+    else ray->moved = 1; /* and stays: a coarse ray's children go on from there */
     ray->steps++;
 }
 

@@ -592,6 +592,19 @@ static double bumps_per_pixel(const scene *s, double t)
     return s->own.shape.kind == SHAPE_BUMPY ? t / focal * s->own.shape.n[2] / s->radius / 6.283185307 : 0;
 }
 
+/* Whether f has both signs between the first and the third of three points on a line: bumps may be finer than these. */
+static int crosses_between(dist_context *ctx, const dist_field *field, const float *ends)
+{
+    enum { COUNT = 65 };
+    float points[3 * COUNT], f[COUNT];
+    int below = 0;
+    for (size_t i = 0; i < COUNT; i++)
+        for (size_t k = 0; k < 3; k++) points[3 * i + k] = ends[k] + (ends[6 + k] - ends[k]) * (float)i / (COUNT - 1);
+    if (dist_field_eval(ctx, field, COUNT, points, f, NULL) != DIST_OK) return 0;
+    for (size_t i = 0; i < COUNT; i++) below += f[i] < 0;
+    return below > 0 && below < COUNT;
+}
+
 /* Hits of ordinary nets, and of instances, by what the field itself says there in float: small, or of another sign
    within the error; but not where that reaches to another surface. */
 static void judge_hits(const scene *s, dist_context *ctx, const dist_field *field, const planes *p)
@@ -618,7 +631,7 @@ static void judge_hits(const scene *s, dist_context *ctx, const dist_field *fiel
         double small = 1.01 * epsilon + rounding * (1 + shape_length((double)g[0], (double)g[1], (double)g[2]));
         int crossed = (f[at] > 0) != (f[at + 1] > 0) || (f[at + 1] > 0) != (f[at + 2] > 0);
         hits_judged++;
-        if (!crossed && !(fabs((double)f[at + 1]) <= small)) {
+        if (!crossed && !(fabs((double)f[at + 1]) <= small) && !crosses_between(ctx, field, points + 3 * at)) {
             if (s->warm && bumps_per_pixel(s, (double)p->distance[i]) > 0.5) unlike_hits++;
             else note(FALSE_HIT, "of the field, f, error", (double)f[at + 1], (double)p->error[i]);
         }

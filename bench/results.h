@@ -54,23 +54,27 @@ static inline const char *results_stem(const results *r, const char *name)
     return stem;
 }
 
-/* Processor, cores, compiler, and the commit if results.sh told it. */
+/* Processor with family and model, cores, compiler, and the commit if results.sh told it. */
 static inline const char *results_machine(void)
 {
     static char text[512];
     char line[256];
     char processor[256] = "unknown processor";
     const char *commit = getenv("DIST_COMMIT");
-    long cores = 0;
+    long cores = 0, family = 0, model = 0;
     FILE *file = fopen("/proc/cpuinfo", "r");
     while (file && fgets(line, sizeof line, file)) {
         char *value = strchr(line, ':');
         if (strncmp(line, "processor", 9) == 0) { cores++; }
+        if (value && strncmp(line, "cpu family", 10) == 0) { family = strtol(value + 1, NULL, 10); }
+        if (value && strncmp(line, "model\t", 6) == 0) { model = strtol(value + 1, NULL, 10); }
         if (!value || strncmp(line, "model name", 10) != 0) { continue; }
         value[strcspn(value, "\n")] = 0;
         snprintf(processor, sizeof processor, "%s", value + 2);
     }
     if (file) { fclose(file); }
+    size_t length = strlen(processor);
+    if (family) { snprintf(processor + length, sizeof processor - length, " family %ld model %ld", family, model); }
 #if defined(__clang__)
     const char *compiler = __VERSION__;
 #elif defined(__GNUC__)

@@ -616,8 +616,9 @@ typedef struct dist_tape dist_tape;
    within its error bound, but those without a query, moved as their neighbors are and asked within 16 renders, only
    where neighbors see alike: not where the surface has bumps finer than two pixels. Between the cones' stop and the
    hit a surface that comes out of nothing is noticed at once if f where the cones stop betrays it, else by the rays
-   that are marched anew in turn: after 128 renders at the latest (64 for pixels that were misses), or, while hits move
-   by 0.1 of the radius or less meanwhile, after 512 (256); and hits around such a ray's new one, one render later. */
+   that are marched anew in turn: a pixel after 512 renders at the latest (256 if it was a miss), after 128 (64) if f at
+   the picture's hits changes by more than 0.0004 of the radius a render, on average. What such a ray finds is followed
+   to its neighbors, within a tile at once where it is nearer by a hundredth of the radius, else pixel by pixel. */
 DIST_API dist_tape *dist_tape_create(dist_context *ctx, const dist_camera *camera, const dist_render_desc *desc);
 DIST_API void dist_tape_destroy(dist_tape *tape);
 
@@ -10801,9 +10802,9 @@ enum { DISTI_ASIDE = 3 }; /* pixels that a surface is moved by, at most */
 
 /* The same where f is off by coarse_error, which moves the surface aside, too: by coarse_error / slope, seen as so many
    pixels. The exact depth is then among those met within them (a step in depth: or a little behind), or, at an outline,
-   up to as far again behind, and no nearer than at an angle at which f falls by a quarter of its slope. On an even
-   surface less than a pixel moves it by as much less; the slope is taken as a quarter of that expected, as that is
-   where f is worse than its Lipschitz figure says. */
+   up to half as far again behind, and at least coarse_error over a quarter of the slope. On an even surface less than a
+   pixel moves it by as much less; the slope is taken as a quarter of that expected, as that is where f is worse than its
+   Lipschitz figure says. */
 static void disti_coarse_doubt(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench)
 {
     int n = tile->width * tile->height;
@@ -10827,7 +10828,7 @@ static void disti_coarse_doubt(const disti_tracer *tracer, const disti_tile *til
         }
         float doubt = DISTI_MAX(near, far);
         int even = doubt <= 2.0f * (DISTI_MIN(near, far) + pixel);
-        if (outline) doubt = DISTI_MAX(1.5f * doubt, 4.0f * moved);
+        if (outline) doubt = DISTI_MAX(1.5f * doubt, DISTI_MIN(4.0f * moved, 2.0f * tracer->field->radius));
         else doubt *= even ? DISTI_MIN(1.0f, 4.0f * pixels) : 1.05f;
         ray->error = DISTI_MAX(ray->error, doubt / ray->cosine);
     }
@@ -11783,7 +11784,7 @@ static size_t disti_warm_pixel(const disti_warm *warm, int i)
 }
 
 /* How much rarer than after `period` turns pixels are marched anew, 1 to 4: what may come up unseen grows with what the
-   picture moves. */
+   picture moves, on average. */
 static unsigned disti_warm_calm(float change, float radius)
 {
     unsigned calm = 1;
@@ -12184,19 +12185,26 @@ static void disti_warm_misses(disti_warm *warm)
     }
 }
 
+/* Whether f is known to be large enough where a nearer surface beside ray i is, or there is none. fresh: for the first
+   time this turn. */
+static int disti_warm_clear(disti_warm *warm, int i, int fresh)
+{
+    float s = warm->tape->nearest[disti_warm_pixel(warm, i)], *bound = &warm->tape->beside[disti_warm_pixel(warm, i)];
+    if (s > 2e38f) return 1;
+    float loss = disti_warm_loss(warm, i, s);
+    if (fresh) *bound = DISTI_MAX(*bound - loss, 0.0f);
+    return *bound > 0.5f * loss + disti_ray_epsilon(warm->tracer, &warm->bench->rays[i], s);
+}
+
 /* What lies beside another surface, hits that have a nearer one beside them and misses, may be covered by that: spheres
    from its distance on until f rises again or is what the hit alone makes it; what they get close to is looked at.
-   1: ray i is to be asked, misses every second turn, and hits too while the picture is calm. fresh: for the first time
-   this turn. */
+   1: ray i is to be asked, misses every second turn, and hits, too, where calm > 1. */
 static int disti_warm_beside(disti_warm *warm, int i, int fresh)
 {
     disti_ray *ray = &warm->bench->rays[i];
-    float s = warm->tape->nearest[disti_warm_pixel(warm, i)], *bound = &warm->tape->beside[disti_warm_pixel(warm, i)];
+    float s = warm->tape->nearest[disti_warm_pixel(warm, i)];
     warm->ask[i] = DISTI_ASK_NOTHING;
-    if (s > 2e38f) return 0;
-    float loss = disti_warm_loss(warm, i, s);
-    if (fresh) *bound = DISTI_MAX(*bound - loss, 0.0f);
-    if (*bound > 0.5f * loss + disti_ray_epsilon(warm->tracer, ray, s)) return 0;
+    if (disti_warm_clear(warm, i, fresh)) return 0;
     int hit = warm->moved[i] < 2e38f && s < ray->best, miss = ray->status == DIST_RAY_MISS && ray->kept;
     int turn = (i % warm->tile->width + i / warm->tile->width + (int)(warm->tape->turn & 1u)) & 1;
     if (!(hit || miss) || !(turn || (hit && warm->calm == 1))) return 0;
@@ -12215,7 +12223,7 @@ static int disti_warm_least(disti_warm *warm, int i, float f)
     disti_ray *ray = &warm->bench->rays[i];
     float epsilon = disti_ray_epsilon(warm->tracer, ray, ray->best), radius = warm->tracer->field->radius;
     float margin = 5.0f * (warm->change + epsilon), value = warm->tape->value[disti_warm_pixel(warm, i)];
-    int odd = (i + i / warm->tile->width + (int)warm->tape->turn) & 1;
+    int odd = (i + i / warm->tile->width + (int)(warm->tape->turn & 1u)) & 1;
     int still = !warm->silhouette && warm->change < 1e-3f * radius && odd && value > 0.0f && f > 3.0f * epsilon;
     if (!(warm->silhouette && value > 0.0f)) margin += 0.03f * radius; /* the bound is used up: a new one */
     ray->f = f;
@@ -12429,6 +12437,7 @@ static void disti_render_warm(const disti_render_job *job, int worker, const dis
     }
     if (good) disti_warm_misses(&warm);
     for (int i = 0; i < warm.n && good; i++) {
+        if (warm.ask[i] == DISTI_ASK_LEAST) disti_warm_clear(&warm, i, 1); /* its own turn comes with its sample */
         if (warm.ask[i] == DISTI_ASK_REFRESH || warm.ask[i] == DISTI_ASK_LEAST) continue;
         if (disti_warm_beside(&warm, i, 1)) disti_warm_list(&warm, i, DISTI_ASK_BESIDE, bench->rays[i].q);
         left += bench->rays[i].mode != DISTI_DONE;

@@ -142,12 +142,43 @@ TEST(what_comes_out_of_nothing_is_seen_at_once)
         memcpy(second, places[k], sizeof places[k]);
         for (int i = 0; i < 8; i++) {
             second[3] = i < 3 ? -0.3f : 0.06f + 0.002f * (float)i;
-            for (int j = 0; j < (i == 7 ? 64 : 1); j++) render(&s, 1, 0, &warm); /* by then every miss had its turn */
+            int turns = i < 7 ? 1 : test_quick() ? 64 : 256; /* by then every miss has had its turn */
+            for (int j = 0; j < turns; j++) render(&s, 1, 0, &warm);
             render(&s, 0, 0, &cold);
             check_same(0, i == 7 || i < 3 ? 1000 : 250); /* pixels of its outline may come late */
         }
         scene_close(&s);
     }
+}
+
+/* A speck that comes out of nothing close above a surface, where f at the cones' stops does not betray it. */
+TEST(what_nothing_foretells_is_seen_when_its_turn_comes)
+{
+    scene s;
+    float radius = 0.6f;
+    int wrong = 0, last = 0, turns = test_quick() ? 0 : 512;
+    scene_open(&s);
+    s.field.user = &radius;
+    s.field.eval_fn = pair_eval;
+    second[0] = 0.62f * sinf(0.15f);
+    second[1] = 0.05f;
+    second[2] = 0.62f * cosf(0.15f);
+    second[3] = -0.3f;
+    for (int i = 0; i < 4; i++) render(&s, 1, 0, &warm);
+    second[3] = 0.01f;
+    render(&s, 0, 0, &cold);
+    for (int i = 1; i <= turns; i++) {
+        render(&s, 1, 0, &warm);
+        wrong = 0;
+        for (int j = 0; j < PIXELS; j++)
+            wrong += cold.mask[j] != warm.mask[j] ||
+                     (cold.mask[j] && fabsf(cold.distance[j] - warm.distance[j]) > cold.error[j] + warm.error[j]);
+        if (wrong) last = i;
+    }
+    if (test_state.verbose) printf("    last seen wrong in render %d\n", last);
+    CHECK_EQUAL(0, wrong);
+    CHECK(last > 1 || turns == 0); /* else it shows nothing */
+    scene_close(&s);
 }
 
 TEST(outlines_that_pass_each_other_are_followed)
@@ -256,6 +287,9 @@ static void check_steps(const char *name, int code, float step, int silhouette, 
         outside++;
         off += fabsf(cold.silhouette[i] - warm.silhouette[i]) > 2e-3f;
     }
+    if (test_state.verbose)
+        printf("    %s, %g radii a step%s: %.3f queries a hit; other, beyond the bounds: %d, %d of %d\n", name,
+               (double)step, silhouette ? ", silhouette" : "", (double)queries / (double)hits, other, far, both);
     CHECK((double)queries <= most * (double)hits);
     CHECK(other * 500 <= both);
     CHECK(far * 250 <= both);
@@ -278,11 +312,11 @@ TEST(trained_nets_of_the_test_data_do_not_drift_either)
     check_steps("fox", 0, 5e-4f, 0, test_quick() ? 20 : 100, 1.1);
     if (test_quick()) return;
     check_steps("fox", 0, 2e-3f, 0, 40, 2.0);
-    check_steps("fox", 0, 5e-4f, 1, 40, 1.7);
-    check_steps("bob_spot", 1, 5e-4f, 0, 40, 0.9);
+    check_steps("fox", 0, 5e-4f, 1, 40, 1.6);
+    check_steps("bob_spot", 1, 5e-4f, 0, 40, 0.85);
     check_steps("bob_spot", 1, 4e-4f, 1, 40, 1.2);
     check_steps("bunny_relu", 0, 5e-4f, 0, 40, 1.0);
-    check_steps("rings", 0, 5e-4f, 0, 40, 1.2);
+    check_steps("rings", 0, 5e-4f, 0, 40, 1.25);
     check_steps("mug_camera_bottle", 0, 4e-4f, 0, 40, 1.7);
     check_steps("mug_camera_bottle", 0, 1e-3f, 0, 40, 3.0); /* half of a tile is not where it was expected */
 }
@@ -363,6 +397,7 @@ int main(int argc, char **argv)
     RUN(a_hundred_small_steps_do_not_drift_and_cost_little);
     RUN(larger_steps_out_of_pixels_and_into_them_are_seen_at_once);
     RUN(what_comes_out_of_nothing_is_seen_at_once);
+    RUN(what_nothing_foretells_is_seen_when_its_turn_comes);
     RUN(outlines_that_pass_each_other_are_followed);
     RUN(another_camera_or_field_is_a_cold_start);
     RUN(nets_that_move_by_half_a_thousandth_cost_1_2_queries_a_hit_and_do_not_drift);

@@ -10802,9 +10802,9 @@ enum { DISTI_ASIDE = 3 }; /* pixels that a surface is moved by, at most */
 
 /* The same where f is off by coarse_error, which moves the surface aside, too: by coarse_error / slope, seen as so many
    pixels. The exact depth is then among those met within them (a step in depth: or a little behind), or, at an outline,
-   up to half as far again behind, and at least coarse_error over a quarter of the slope. On an even surface less than a
-   pixel moves it by as much less; the slope is taken as a quarter of that expected, as that is where f is worse than its
-   Lipschitz figure says. */
+   up to half as far again behind, and at least coarse_error over a quarter of the slope. On an even surface less than
+   a pixel moves it by as much less; the slope is taken as a quarter of that expected, as that is where f is worse than
+   its Lipschitz figure says. */
 static void disti_coarse_doubt(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench)
 {
     int n = tile->width * tile->height;

@@ -607,7 +607,8 @@ static void print_sums(const table *t)
     if (count > 0) {
         fprintf(stderr, "%.0f compact shapes at 1024 x 1024: %.1f times the speed of the paper's tracer (geometric "
                 "mean), %.1f at least; at the paper's error %.1f, %.1f at least; of the paper's with all units %.1f, "
-                "%.1f at least; goal 8\n", count, exp(product / count), least, exp(coarse / fmax(1, coarse_count)), least_coarse,
+                "%.1f at least; goal 8\n", count, exp(product / count), least,
+                coarse_count > 0 ? exp(coarse / coarse_count) : 0, coarse_count > 0 ? least_coarse : 0,
                 exp(dense / count), least_dense);
     }
 }

@@ -151,7 +151,7 @@ mkdir -p build/work_precision || exit 1
 table_size=128
 at_once=1
 shown="torus_grazing_128 rods_1e-3_128 embedded_5_128 mug_128 fox_512"
-how="--minutes 1.35"
+how="--minutes 0.8"
 if [ -n "$quick" ]; then
     table_size=64
     shown="embedded_5_64"

@@ -105,7 +105,8 @@ typedef struct dist_allocator {
 /* Parallelism. run_fn calls task_fn(arg, index, worker) once for every index in 0..count-1, in any order, and returns
    when all are done. `worker` is 0..dist_context_desc.workers-1 and no two calls with one worker overlap.
    Fastest: each worker takes the next index when it is done with one; costs differ, and the largest come first where
-   they are known. task_fn never calls back into run_fn. NULL: OpenMP when the compiler has it on, else serial. */
+   they are known. task_fn never calls back into run_fn. Tried on 64 indices when the context is made; leaving one out,
+   doing it twice and a worker out of range are refused. NULL: OpenMP when the compiler has it on, else serial. */
 typedef void (*dist_task_fn)(void *arg, int index, int worker);
 typedef struct dist_scheduler {
     void *user;
@@ -292,8 +293,9 @@ typedef struct dist_similarity {
     float translation[3];
 } dist_similarity;
 
-/* scale *= exp(step[0]), rotation <- exp([step[1..3]]x) rotation, kept orthonormal, translation += step[4..6]: the step
-   for a gradient of a placement's seven numbers, against it as in dist_camera_move. */
+/* scale *= exp(step[0]) (within 1e-30 to 1e30), rotation <- exp([step[1..3]]x) rotation, kept orthonormal,
+   translation += step[4..6]: the step for a gradient of a placement's seven numbers, against it as in
+   dist_camera_move. */
 DIST_API void dist_similarity_move(dist_similarity *placement, const float step[7]);
 
 /* A field and where it stands. */
@@ -445,7 +447,7 @@ typedef struct dist_camera {
 
 /* fx = fy = height / 2 / tan(fov_y / 2), cx = (width - 1) / 2, cy = (height - 1) / 2, pixel centers at integers.
    Degenerate input (eye = at, up along the view) is repaired by choosing another up; what cannot be repaired, such as
-   fov_y in degrees, makes fx 0, which the function that takes the camera refuses. */
+   fov_y in degrees, makes fx 0 or something not finite, which the function that takes the camera refuses. */
 DIST_API dist_camera dist_camera_look_at(int width, int height, float fov_y /* radians, above 0, below pi */,
                                          const float eye[3], const float at[3], const float up[3]);
 /* camera_to_world: row-major 3 x 4 or the upper part of 4 x 4, x right, y up, z backward (OpenGL, Blender, NeRF). */
@@ -532,7 +534,8 @@ typedef struct dist_stats {
     unsigned long long queries;         /* points at which f was evaluated, everything included */
     unsigned long long cone_queries, march_queries, refine_queries, silhouette_queries,
         normal_queries, color_queries; /* their parts */
-    unsigned long long hits, unresolved, inside, plateau, not_finite;
+    unsigned long long hits;            /* mask 1: with DIST_INSIDE_HIT those INSIDE, too */
+    unsigned long long unresolved, inside, plateau, not_finite;
     unsigned long long capped;          /* backward: rays whose grad f . v was capped, or grad f 0: then without pull */
     unsigned long long backward_points; /* backward: points through the adjoint */
     unsigned long long skipped;         /* backward: pixels with a zero upstream gradient */
@@ -577,8 +580,8 @@ typedef struct dist_contact {
     int status;      /* DIST_RAY_HIT: they touch; DIST_RAY_MISS; else as dist_field_closest_point */
 } dist_contact;
 
-/* n spheres (n, 4), center and radius (0 or more), against the field. A sphere that is clear of it costs one query, or
-   none where it is clear of the bounding sphere. */
+/* n spheres (n, 4), center and radius (below 0: refused), against the field. A sphere that is clear of it costs one
+   query, or none where it is clear of the bounding sphere. */
 DIST_API dist_status dist_field_collide(dist_context *ctx, const dist_field *field, size_t n, const float *spheres,
                                         dist_contact *contacts);
 
@@ -642,7 +645,8 @@ DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *ta
 
 /* Each returns weight * loss and adds its gradient to the d_ array unless that is NULL. n: pixels. Means are over the
    pixels that count; none, or a plane that is NULL: 0 and no gradient. Sums are kept in double.
-   A target counts where it is finite and 0 < target < 1e5; mask may be NULL: then every pixel is a hit. */
+   A target counts where it is finite and 0 < target < 1e5; mask may be NULL: then every pixel is a hit. What is not
+   finite does not count: a loss does not tell that a code or a picture is spoiled. */
 
 /* mean |depth - target| over hit, observed pixels */
 DIST_API float dist_loss_depth(size_t n, const float *depth, const float *target, const unsigned char *mask,
@@ -744,7 +748,8 @@ DIST_API dist_status dist_mesh_backward(dist_context *ctx, const dist_field *fie
                                         const float *d_vertices, const dist_gradients *grads);
 #endif
 
-/* n points (n, 3), uniform over the area, the same for the same seed. An empty mesh is refused. */
+/* n points (n, 3), uniform over the area, the same for the same seed. Refused: an empty mesh, one whose area is not
+   finite, an index out of range. */
 DIST_API dist_status dist_mesh_sample(dist_context *ctx, const dist_mesh *mesh, unsigned seed, size_t n, float *points);
 
 /* Chamfer distance as DeepSDF defines it: mean over a of squared distance to the nearest of b, plus the same the
@@ -791,7 +796,7 @@ typedef struct dist_workspace_desc {
     const dist_context_desc *context; /* dist_context_create; NULL: its defaults */
     const void *model, *texture;      /* dist_net_load of these bytes, for the shapes and for their texture */
     size_t model_size, texture_size;
-    const dist_net *net, *texture_net; /* instead: nets that are there already, loaded elsewhere */
+    const dist_net *net, *texture_net; /* where these are NULL: nets that are there already, loaded elsewhere */
     int shapes;    /* dist_shape_create as often, each with dist_shape_set_texture; 0: once, where there is a net */
     int instances; /* dist_scene_create of so many of these shapes */
     const dist_camera *camera; /* dist_tape_create for it and how. The size of a picture without a tape, its planes and
@@ -1158,7 +1163,7 @@ static dist_status disti_limits(dist_context *ctx, const char *function, size_t 
         memcpy(text + n, ": ", 2);
         memcpy(text + n + 2, limits->name, strlen(limits->name) + 1);
         return disti_fail(ctx, DIST_BAD_ARGUMENT,
-                          limits->high > 1e38  ? "%s is %d, must be 0 or positive"
+                          limits->high > 1e38  ? "%s is %d, must be finite, 0 or positive"
                           : limits->low > 0.0 ? "%s is %d, must be 1 to %d"
                                               : "%s is %d, must be 0 to %d",
                           text, x, limits->high);
@@ -1166,13 +1171,20 @@ static dist_status disti_limits(dist_context *ctx, const char *function, size_t 
     return DIST_OK;
 }
 
-/* NULL, after disti_fail, where the allocator refuses or bytes is SIZE_MAX (the mark of an overflow). */
+static int disti_is_aligned(const void *p) { return (uintptr_t)p % DISTI_ALIGNMENT == 0; }
+
+/* NULL, after disti_fail, where the allocator refuses, ignores the alignment, or bytes is SIZE_MAX (the mark of an
+   overflow). */
 static void *disti_alloc(dist_context *ctx, size_t bytes)
 {
     if (bytes == 0) bytes = DISTI_ALIGNMENT;
     void *p = bytes == (size_t)-1 ? NULL : ctx->allocator.alloc_fn(ctx->allocator.user, bytes, DISTI_ALIGNMENT);
     if (!p) disti_fail(ctx, DIST_OUT_OF_MEMORY, "out of memory: %d bytes were asked for", NULL, (double)bytes, 0);
-    return p;
+    if (disti_is_aligned(p)) return p;
+    ctx->allocator.free_fn(ctx->allocator.user, p, bytes);
+    disti_fail(ctx, DIST_OUT_OF_MEMORY, "allocator.alloc_fn gave %d bytes that are not aligned to %d", NULL,
+               (double)bytes, DISTI_ALIGNMENT);
+    return NULL;
 }
 
 /* Room for count things of `each` bytes. */
@@ -1492,6 +1504,33 @@ static int disti_blas_works(const dist_blas *blas)
     return 1;
 }
 
+enum { DISTI_TRIALS = 64 };
+
+typedef struct disti_trial {
+    int workers;
+    volatile unsigned char wrong, done[DISTI_TRIALS];
+} disti_trial;
+
+static void disti_trial_task(void *arg, int index, int worker)
+{
+    disti_trial *trial = (disti_trial *)arg;
+    if (index < 0 || index >= DISTI_TRIALS || worker < 0 || worker >= trial->workers) trial->wrong = 1;
+    else trial->done[index] = (unsigned char)(trial->done[index] + 1);
+}
+
+/* Every index once, by a worker there is. */
+static int disti_scheduler_works(const dist_scheduler *scheduler, int workers)
+{
+    disti_trial trial;
+    trial.workers = workers;
+    trial.wrong = 0;
+    for (int i = 0; i < DISTI_TRIALS; i++) trial.done[i] = 0;
+    scheduler->run_fn(scheduler->user, DISTI_TRIALS, disti_trial_task, &trial);
+    for (int i = 0; i < DISTI_TRIALS; i++)
+        if (trial.done[i] != 1) return 0;
+    return !trial.wrong;
+}
+
 /* What is wrong with desc, as a status with its sentence. */
 static dist_status disti_context_check(dist_context *ctx, const dist_context_desc *desc)
 {
@@ -1505,6 +1544,10 @@ static dist_status disti_context_check(dist_context *ctx, const dist_context_des
                           dist_isa_name(desc->isa), 0, 0);
     if (desc->scheduler.run_fn && desc->workers == 0)
         return disti_refuse(ctx, "%s: workers is 0, must be told with a scheduler", name);
+    if (desc->scheduler.run_fn && !disti_scheduler_works(&desc->scheduler, desc->workers))
+        return disti_fail(ctx, DIST_BAD_ARGUMENT,
+                          "%s: scheduler.run_fn fails its self-test: each index from 0 to count - 1 once, by a worker "
+                          "from 0 to %d", name, desc->workers - 1, 0);
     if (desc->blas_width < 0)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: blas_width is %d, must not be negative", name, desc->blas_width,
                           0);
@@ -1561,8 +1604,8 @@ DIST_API dist_context *dist_context_create(const dist_context_desc *desc)
     if (desc) d = *desc;
     if (!disti_allocator_of(&d, &allocator)) return NULL;
     dist_context *ctx = (dist_context *)allocator.alloc_fn(allocator.user, sizeof(dist_context), DISTI_ALIGNMENT);
-    if (!ctx || disti_context_begin(ctx, &d, &allocator) != DIST_OUT_OF_MEMORY) return ctx;
-    disti_free(ctx, ctx, sizeof *ctx);
+    if (!ctx || (disti_is_aligned(ctx) && disti_context_begin(ctx, &d, &allocator) != DIST_OUT_OF_MEMORY)) return ctx;
+    allocator.free_fn(allocator.user, ctx, sizeof *ctx);
     return NULL;
 }
 
@@ -4582,8 +4625,8 @@ DIST_API dist_status dist_scene_set(dist_scene *scene, int index, const dist_ins
     if (!scene) return DIST_BAD_ARGUMENT;
     if (!instance || index < 0 || index >= scene->count)
         return disti_fail(scene->ctx, DIST_BAD_ARGUMENT,
-                          "dist_scene_set: index is %d of %d instances; instance must not be NULL", NULL, index,
-                          scene->count);
+                          "dist_scene_set: index is %d, must be 0 to %d; instance must not be NULL", NULL, index,
+                          scene->count - 1);
     return disti_scene_place(scene, index, instance, 0, "dist_scene_set");
 }
 
@@ -4764,6 +4807,8 @@ DIST_API void dist_similarity_move(dist_similarity *placement, const float step[
     if (memcmp(placement->rotation, zero, sizeof zero) == 0)
         placement->rotation[0] = placement->rotation[4] = placement->rotation[8] = 1.0f;
     placement->scale *= expf(step[0]);
+    if (placement->scale < 1e-30f) placement->scale = 1e-30f;
+    if (placement->scale > 1e30f) placement->scale = 1e30f;
     disti_turn(step + 1, placement->rotation);
     for (int i = 0; i < 3; i++) placement->translation[i] += step[4 + i];
 }
@@ -5274,8 +5319,8 @@ static const unsigned char *disti_utf8_end(const unsigned char *c, const unsigne
 static int disti_archive_header(disti_reader *r, size_t size)
 {
     static const char others[5][2][37] = {
-        {"PK\3\4", "a PyTorch checkpoint (zip)"}, {"\x80", "a PyTorch checkpoint (pickle)"}, {"GGUF", "a GGUF file"},
-        {"\x93NUMPY", "a numpy file"}, {"\x89HDF", "an HDF5 file"}};
+        {"PK\3\4", "a zip (PyTorch checkpoint, or .npz)"}, {"\x80", "a PyTorch checkpoint (pickle)"},
+        {"GGUF", "a GGUF file"}, {"\x93NUMPY", "a numpy file"}, {"\x89HDF", "an HDF5 file"}};
     uint64_t length = 0;
     for (size_t i = 0; i < 8 && i < size; i++) length |= (uint64_t)r->bytes[i] << 8 * i;
     for (int i = 0; i < 5; i++)
@@ -7381,17 +7426,22 @@ static dist_status disti_code_copy(dist_context *ctx, const char *function, size
     return DIST_OK;
 }
 
-DIST_API dist_status dist_shape_set_code(dist_shape *shape, const float *code)
+/* Copies the code and folds both nets with it. */
+static dist_status disti_shape_set_code(dist_shape *shape, const float *code, const char *function)
 {
-    if (!shape) return DIST_BAD_ARGUMENT;
     size_t size = (size_t)shape->net->code_size;
-    dist_status status = disti_code_copy(shape->ctx, "dist_shape_set_code", size, code, shape->code);
+    dist_status status = disti_code_copy(shape->ctx, function, size, code, shape->code);
     if (status != DIST_OK) return status;
     disti_shape_fold(shape);
     if (!shape->texture) return DIST_OK;
     memcpy(shape->texture->code, shape->code, size * sizeof(float));
     disti_shape_fold(shape->texture);
     return DIST_OK;
+}
+
+DIST_API dist_status dist_shape_set_code(dist_shape *shape, const float *code)
+{
+    return shape ? disti_shape_set_code(shape, code, "dist_shape_set_code") : DIST_BAD_ARGUMENT;
 }
 
 DIST_API dist_status dist_shape_set_color_code(dist_shape *shape, const float *color_code)
@@ -7460,7 +7510,7 @@ DIST_API dist_shape *dist_shape_create(dist_context *ctx, const dist_net *net, c
     shape->net = net;
     if (disti_shape_take(shape) != DIST_OK) goto fail;
     memset(shape->bias, 0, (size_t)(net->layers + 1) * (size_t)net->max_rows * sizeof(float));
-    if (dist_shape_set_code(shape, code) != DIST_OK) goto fail;
+    if (disti_shape_set_code(shape, code, "dist_shape_create") != DIST_OK) goto fail;
     shape->lipschitz = shape->lipschitz_far = 1.0f;
     shape->half = net->half;
     if (net->sdf_channel >= 0) {
@@ -8462,8 +8512,10 @@ DIST_API dist_status dist_net_set_code(dist_context *ctx, dist_net *net, int ind
         return disti_fail(ctx, DIST_BAD_ARGUMENT,
                           "dist_net_set_code: index is %d of %d codes; net and code must not be NULL", NULL, index,
                           net ? net->code_count : 0);
-    if (!disti_finite_all((size_t)net->code_size, code))
-        return disti_fail(ctx, DIST_NOT_FINITE, "dist_net_set_code: code must be finite", NULL, 0, 0);
+    for (int i = 0; i < net->code_size; i++)
+        if (!disti_finite(code[i]))
+            return disti_fail(ctx, DIST_NOT_FINITE, "dist_net_set_code: code[%d] is %d, must be finite", NULL, i,
+                              (double)code[i]);
     memcpy(net->codes + (size_t)index * (size_t)net->code_size, code, (size_t)net->code_size * sizeof(float));
     return DIST_OK;
 }
@@ -8546,8 +8598,8 @@ DIST_API dist_camera dist_camera_look_at(int width, int height, float fov_y, con
     camera.height = height;
     if (fov_y > 0.0f && fov_y < 3.14159265f) /* else 0, as below: refused by whoever takes the camera */
         camera.fx = camera.fy = (float)(height / 2.0 / tan((double)fov_y / 2.0));
-    camera.cx = (float)((width - 1) / 2.0);
-    camera.cy = (float)((height - 1) / 2.0);
+    camera.cx = (float)((width - 1.0) / 2.0);
+    camera.cy = (float)((height - 1.0) / 2.0);
     if ((eye && !disti_finite_all(3, eye)) || (at && !disti_finite_all(3, at)) || (up && !disti_finite_all(3, up)))
         camera.fx = 0.0f;
     for (int i = 0; i < 3; i++) {
@@ -10195,6 +10247,10 @@ static dist_status disti_foot_run(disti_foot_job *job, const char *function, con
     if (job->n > 0 && (!job->points || !out))
         return disti_fail(job->ctx, DIST_BAD_ARGUMENT, "%s: points, spheres or the array for the answers is NULL",
                           function, 0, 0);
+    for (size_t i = 0; i < job->n && job->contacts; i++)
+        if (job->points[4 * i + 3] < 0.0f)
+            return disti_fail(job->ctx, DIST_BAD_ARGUMENT, "%s: the radius of sphere %d is %d, must be 0 or positive",
+                              function, (double)i, (double)job->points[4 * i + 3]);
     disti_run(job->ctx, (int)((job->n + DISTI_FEET - 1) / DISTI_FEET), disti_foot_task, job);
     return DIST_OK;
 }
@@ -14332,6 +14388,8 @@ DIST_API dist_status dist_mesh_sample(dist_context *ctx, const dist_mesh *mesh, 
     double sum = 0.0;
     dist_status status = disti_enter(ctx);
     if (status != DIST_OK) return status;
+    status = disti_count_check(ctx, n, name);
+    if (status != DIST_OK) return status;
     if (!mesh || (n && !points)) return disti_refuse(ctx, "dist_mesh_sample: %s is NULL", mesh ? "points" : "mesh");
     if (count == 0) return disti_refuse(ctx, "%s: the mesh has no triangles", name);
     if (!disti_mesh_check(mesh, DIST_BAD_ARGUMENT, "%s: a triangle has vertex %d, must be below %d", name))
@@ -14526,6 +14584,8 @@ static dist_status disti_chamfer_one_way(dist_context *ctx, const disti_tree *fr
 static dist_status disti_chamfer_check(dist_context *ctx, size_t n, const float *points, const char *what)
 {
     if (n == 0) return disti_refuse(ctx, "dist_chamfer: %s has no points", what);
+    dist_status status = disti_count_check(ctx, n, "dist_chamfer");
+    if (status != DIST_OK) return status;
     if (!points) return disti_refuse(ctx, "dist_chamfer: %s is NULL", what);
     for (size_t i = 0; i < n; i++)
         if (!disti_finite_all(3, points + 3 * i))
@@ -15242,7 +15302,13 @@ typedef struct disti_measure {
     size_t bytes;
     int real; /* the next requests are passed on */
     dist_allocator allocator;
+    unsigned char place[DISTI_ALIGNMENT]; /* its aligned address is the one that is given */
 } disti_measure;
+
+static void *disti_measure_place(disti_measure *m)
+{
+    return m->place + (DISTI_ALIGNMENT - (uintptr_t)m->place % DISTI_ALIGNMENT) % DISTI_ALIGNMENT;
+}
 
 static void *disti_measure_alloc(void *user, size_t bytes, size_t alignment)
 {
@@ -15251,14 +15317,14 @@ static void *disti_measure_alloc(void *user, size_t bytes, size_t alignment)
     if (!disti_size_add(bytes, DISTI_ALIGNMENT - 1, &whole) ||
         !disti_size_add(m->bytes, whole & ~(size_t)(DISTI_ALIGNMENT - 1), &m->bytes))
         return NULL;
-    if (!m->real) return m;
+    if (!m->real) return disti_measure_place(m);
     return m->allocator.alloc_fn ? m->allocator.alloc_fn(m->allocator.user, bytes, alignment) : NULL;
 }
 
 static void disti_measure_free(void *user, void *pointer, size_t bytes)
 {
-    const disti_measure *m = (const disti_measure *)user;
-    if (pointer != user) m->allocator.free_fn(m->allocator.user, pointer, bytes);
+    disti_measure *m = (disti_measure *)user;
+    if (pointer != disti_measure_place(m)) m->allocator.free_fn(m->allocator.user, pointer, bytes);
 }
 
 /* As dist_net_load, without numbers. */
@@ -15332,8 +15398,10 @@ DIST_API size_t dist_workspace_bytes(const dist_workspace_desc *desc)
     if (status == DIST_OK && d.texture) status = disti_measure_net(&ctx, &m, d.texture, d.texture_size, &texture);
     if (status != DIST_OK) return 0;
     const dist_net *shaped = d.model ? &net : d.net, *colored = d.texture ? &texture : d.texture_net;
-    if (d.shapes < 0 || d.shapes > 1 << 20 || d.instances < 0 || d.instances > 1 << 20 ||
-        (!shaped && (d.shapes || d.instances || colored)))
+    if (!shaped && colored)
+        status = disti_refuse(&ctx, "%s: a texture is given, but net and model are NULL", name);
+    else if (d.shapes < 0 || d.shapes > 1 << 20 || d.instances < 0 || d.instances > 1 << 20 ||
+        (!shaped && (d.shapes || d.instances)))
         status = disti_fail(&ctx, DIST_BAD_ARGUMENT,
                             "%s: shapes is %d, instances %d; must be 0 to 2^20, and 0 without a net", name,
                             d.shapes, d.instances);

@@ -122,6 +122,8 @@ TEST(look_at_repairs_a_degenerate_view)
     }
     dist_camera none = dist_camera_look_at(8, 8, 0.7f, NULL, NULL, NULL);
     CHECK(off_orthonormal(none.rotation) < 1e-6);
+    dist_camera least = dist_camera_look_at(INT32_MIN, INT32_MIN, 0.7f, NULL, NULL, NULL); /* refused later */
+    CHECK_EQUAL(INT32_MIN, least.width);
 }
 
 TEST(look_at_of_garbage_gives_a_camera_that_render_refuses)

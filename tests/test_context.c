@@ -318,6 +318,78 @@ TEST(garbage_descs_come_back_as_a_context_that_says_so)
     CHECK_EQUAL(0, allocator.errors);
 }
 
+/* 0: none is run; 1: every other; 2: each twice; 3: worker -1; 4: workers from 1 on; 5: indices from 1 on. */
+static void wrong_schedule(void *user, int count, dist_task_fn task_fn, void *arg)
+{
+    int kind = *(const int *)user;
+    for (int i = 0; i < count && kind; i += 1 + (kind == 1)) {
+        task_fn(arg, i + (kind == 5), kind == 3 ? -1 : kind == 4 ? 1 + i % 2 : i % 2);
+        if (kind == 2) task_fn(arg, i, 0);
+    }
+}
+
+TEST(a_scheduler_that_does_not_do_what_it_should_is_refused)
+{
+    for (int kind = 0; kind < 6; kind++) {
+        dist_context_desc desc = test_context_desc();
+        desc.workers = 2;
+        desc.scheduler.user = &kind;
+        desc.scheduler.run_fn = wrong_schedule;
+        dist_context *ctx = dist_context_create(&desc);
+        REQUIRE(ctx != NULL);
+        CHECK_STATUS(DIST_BAD_ARGUMENT, dist_context_status(ctx), ctx);
+        CHECK_TEXT("scheduler.run_fn fails its self-test", dist_context_message(ctx));
+        dist_context_destroy(ctx);
+    }
+}
+
+/* Whose alignment is 4 from the `good`th allocation on. */
+typedef struct askew {
+    int good, held;
+    size_t used;
+    unsigned char memory[1 << 22];
+} askew;
+
+static void *askew_alloc(void *user, size_t bytes, size_t alignment)
+{
+    askew *a = (askew *)user;
+    size_t start = a->used + alignment - (size_t)((uintptr_t)(a->memory + a->used) % alignment);
+    if (bytes > sizeof a->memory || start + bytes + 4 > sizeof a->memory) return NULL;
+    a->used = start + bytes + 4;
+    a->held++;
+    return a->memory + start + (a->good-- > 0 ? 0 : 4);
+}
+
+static void askew_free(void *user, void *pointer, size_t bytes)
+{
+    (void)pointer;
+    (void)bytes;
+    ((askew *)user)->held--;
+}
+
+TEST(an_allocator_that_ignores_the_alignment_is_refused)
+{
+    static askew a;
+    for (int good = 0; good < 4; good++) {
+        dist_context_desc desc = test_context_desc();
+        float points[3] = {0, 0, 0};
+        double chamfer;
+        a.good = good;
+        a.used = 0;
+        desc.allocator.user = &a;
+        desc.allocator.alloc_fn = askew_alloc;
+        desc.allocator.free_fn = askew_free;
+        dist_context *ctx = dist_context_create(&desc);
+        if (good == 3) REQUIRE(ctx != NULL);
+        if (ctx) {
+            CHECK_STATUS(DIST_OUT_OF_MEMORY, dist_chamfer(ctx, 1, points, 1, points, &chamfer, NULL), ctx);
+            CHECK_TEXT("not aligned to 64", dist_context_message(ctx));
+        }
+        dist_context_destroy(ctx);
+        CHECK_EQUAL(0, a.held);
+    }
+}
+
 TEST(every_isa_is_in_force_or_refused_by_name)
 {
     static const char *const names[6] = {"auto", "scalar", "sse2", "avx2", "avx512", "neon"};
@@ -574,6 +646,8 @@ int main(int argc, char **argv)
     RUN(half_an_allocator_makes_no_context);
     RUN(a_scheduler_of_any_order_gives_the_same_pictures_and_gradients);
     RUN(garbage_descs_come_back_as_a_context_that_says_so);
+    RUN(a_scheduler_that_does_not_do_what_it_should_is_refused);
+    RUN(an_allocator_that_ignores_the_alignment_is_refused);
     RUN(every_isa_is_in_force_or_refused_by_name);
     RUN(null_is_refused_everywhere_without_a_crash);
     RUN(the_first_failure_is_kept_and_the_logger_told_all);

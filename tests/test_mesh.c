@@ -598,6 +598,8 @@ TEST(samples_are_uniform_over_the_area_and_repeat_for_a_seed)
         y += py;
     }
     CHECK_NEAR(0.75, upper / (double)COUNT, 0.01);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_mesh_sample(ctx, mesh, 5, (size_t)-1, p), ctx);
+    dist_context_clear(ctx);
     CHECK_NEAR(1.0 / 3, x / (double)COUNT, 0.005);
     CHECK_NEAR(1.0 / 3, y / (double)COUNT, 0.005);
     mesh->triangle_count = 0;
@@ -722,6 +724,9 @@ TEST(chamfer_refuses_points_that_are_not_finite_and_empty_clouds)
     CHECK_STATUS(DIST_NOT_FINITE, dist_chamfer(ctx, 1, b, 2, a, &chamfer, NULL), ctx);
     CHECK_STATUS(DIST_BAD_ARGUMENT, dist_chamfer(ctx, 0, a, 1, b, &chamfer, NULL), ctx);
     CHECK_STATUS(DIST_BAD_ARGUMENT, dist_chamfer(ctx, 1, b, 1, NULL, &chamfer, NULL), ctx);
+    dist_context_clear(ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_chamfer(ctx, 1, b, (size_t)-1, b, &chamfer, NULL), ctx);
+    CHECK_TEXT("more than memory can hold", dist_context_message(ctx));
     CHECK_STATUS(DIST_BAD_ARGUMENT, dist_chamfer(NULL, 1, b, 1, b, &chamfer, NULL), NULL);
     dist_context_destroy(ctx);
 }

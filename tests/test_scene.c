@@ -956,6 +956,11 @@ TEST(moving_a_placement_keeps_it_a_similarity)
     CHECK_NEAR(1, s.rotation[4], 0);
     dist_similarity_move(NULL, zero);
     dist_similarity_move(&s, NULL);
+    for (int k = 0; k < 3; k++) { /* never 0, which would mean 1 */
+        float far[7] = {k == 1 ? 1000.0f : -1000.0f, 0, 0, 0, 0, 0, 0};
+        dist_similarity_move(&s, far);
+        CHECK(s.scale > 0 && test_finite((double)s.scale));
+    }
 }
 
 static int refused(dist_context *ctx, const dist_instance *instance, const char *sentence)
@@ -1025,7 +1030,7 @@ TEST(radii_that_floats_cannot_square_are_refused)
     memset(&instance, 0, sizeof instance);
     instance.field = &field;
     field.color_code_size = -1;
-    refused(ctx, &instance, "field.color_code_size is -1, must be 0 or positive");
+    refused(ctx, &instance, "field.color_code_size is -1, must be finite, 0 or positive");
     dist_context_destroy(ctx);
 }
 

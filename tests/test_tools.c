@@ -478,6 +478,10 @@ TEST(what_has_no_answer_says_so)
     CHECK_EQUAL(DIST_RAY_NOT_FINITE, contacts[0].status);
     CHECK_EQUAL(DIST_RAY_NOT_FINITE, contacts[1].status);
     CHECK_STATUS(DIST_OK, dist_field_collide(ctx, &field, 0, NULL, NULL), ctx);
+    float negative[8] = {0, 0, 0, 1, 0, 0, 0, -1};
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_collide(ctx, &field, 2, negative, contacts), ctx);
+    CHECK_TEXT("radius of sphere 1 is -1", dist_context_message(ctx));
+    dist_context_clear(ctx);
     CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_collide(ctx, &field, 1, NULL, contacts), ctx);
     CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_collide(ctx, NULL, 1, p, contacts), ctx);
     CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_collide(NULL, &field, 1, p, contacts), ctx);

@@ -294,6 +294,8 @@ TEST(what_cannot_be_made_has_no_bytes_and_a_sentence)
     check_refused(&d, &h, DIST_BAD_ARGUMENT, "instances -1");
     d = good, d.model = NULL, d.shapes = 1;
     check_refused(&d, &h, DIST_BAD_ARGUMENT, "0 without a net");
+    d = good, d.model = NULL, d.shapes = 0, d.texture = file, d.texture_size = size;
+    check_refused(&d, &h, DIST_BAD_ARGUMENT, "a texture is given, but net and model are NULL");
     d = good, d.texture = file, d.texture_size = size;
     check_refused(&d, &h, DIST_UNSUPPORTED, "no channels r,g,b");
     d = good, camera.width = 0;

@@ -3050,9 +3050,9 @@ typedef struct disti_half {
 #define DISTI_FINISH(V)
 DISTI_FUNCTION void disti_flush_f16(float *sum, __m512 v)
 {
-    const __m512 both = _mm512_maskz_shuffle_f32x4(0xffff, v, v, 0xee); /* the upper half, twice */
-    const __m512 low = _mm512_maskz_cvtph_ps(0xffff, _mm512_castsi512_si256(_mm512_castps_si512(v)));
-    const __m512 high = _mm512_maskz_cvtph_ps(0xffff, _mm512_castsi512_si256(_mm512_castps_si512(both)));
+    const __m512i bits = _mm512_castps_si512(v); /* parted with a mask: gcc's plain ways warn in C++ */
+    const __m512 low = _mm512_maskz_cvtph_ps(0xffff, _mm512_maskz_extracti64x4_epi64(0xff, bits, 0));
+    const __m512 high = _mm512_maskz_cvtph_ps(0xffff, _mm512_maskz_extracti64x4_epi64(0xff, bits, 1));
     _mm512_storeu_ps(sum, _mm512_add_ps(_mm512_loadu_ps(sum), low));
     _mm512_storeu_ps(sum + 16, _mm512_add_ps(_mm512_loadu_ps(sum + 16), high));
 }
@@ -6414,7 +6414,7 @@ static size_t disti_group_layout(const dist_net *net, unsigned char *base, const
     size_t at = 0, rows = (size_t)net->max_rows, row = DISTI_BLOCK * sizeof(float), all = (size_t)net->layers * rows;
     memset(g, 0, sizeof *g);
     for (int j = 0; j < DISTI_GROUP; j++) { /* a reverse pass begins when these are done with */
-        g->x[0][j] = j < 2 ? b->act[j] : b->delta[j - 2];
+        g->x[0][j] = (j < 2 ? b->act : b->delta)[j & 1];
         if (j >= net->fold_count) g->x[1][j] = (float *)disti_take(base, &at, rows, row);
         else g->x[1][j] = base ? b->fold_delta + (size_t)j * rows * DISTI_BLOCK : NULL;
     }

@@ -226,7 +226,7 @@ typedef struct dist_field {
     float cost;
     int kinks;       /* 1: grad f jumps (ReLU), which second_fn leaves out: a normal's gradient is by differences */
     int many;        /* 1: eval_fn is the faster the more points it gets at once, up to thousands */
-    int code_size;   /* length of d_code; for a render's gradient of a field of your own at most 984 */
+    int code_size;   /* length of d_code; for a render's gradient of a field of your own at most 992 */
     size_t weight_count;       /* length of d_weights; 0: none */
     int color_code_size;       /* length of d_color_code */
     size_t color_weight_count; /* of a color net of its own; 0: the weights of color, if any, are among weight_count */
@@ -832,6 +832,9 @@ DIST_API size_t dist_workspace_bytes(const dist_workspace_desc *desc);
 #ifndef DIST_NO_STDIO
 #include <stdio.h>
 #endif
+#if defined(DIST_NO_SIMD) || !(defined(__x86_64__) || defined(_M_X64) || defined(__aarch64__) || defined(_M_ARM64))
+#include <fenv.h> /* the rounding mode, where it stands in no register that is known here */
+#endif
 
 #ifdef __cplusplus
 extern "C" {
@@ -946,11 +949,18 @@ static int disti_finite_double(double x)
     return (bits & 0x7ff0000000000000u) != 0x7ff0000000000000u;
 }
 
-/* *to += x; a sum beyond float's range is its largest number, and what is not finite adds nothing. */
+/* Beyond float's range its largest number. */
+static float disti_within_float(double x)
+{
+    const double most = 3.4e38;
+    return (float)DISTI_MIN(DISTI_MAX(x, -most), most);
+}
+
+/* *to += x within float's range; what is not finite adds nothing. */
 DISTI_UNUSED static void disti_add_gradient(float *to, double x)
 {
-    double sum = (double)*to + x, most = 3.4e38;
-    if (disti_finite_double(sum)) *to = (float)DISTI_MIN(DISTI_MAX(sum, -most), most);
+    double sum = (double)*to + x;
+    if (disti_finite_double(sum)) *to = disti_within_float(sum);
 }
 
 /* *out = a * b or a + b; returns 0 and leaves SIZE_MAX if that does not fit. */
@@ -1319,6 +1329,19 @@ static void disti_float_state_leave(unsigned state)
 {
     uint64_t theirs = state;
     __asm__ volatile("msr fpcr, %0" : : "r"(theirs));
+}
+#elif defined(FE_TONEAREST)
+/* Elsewhere C sees to the rounding, which is what results depend on. */
+static unsigned disti_float_state_enter(void)
+{
+    int state = fegetround();
+    if (state != FE_TONEAREST) fesetround(FE_TONEAREST);
+    return (unsigned)state;
+}
+
+static void disti_float_state_leave(unsigned state)
+{
+    if ((int)state != FE_TONEAREST) fesetround((int)state);
 }
 #else
 static unsigned disti_float_state_enter(void) { return 0; }
@@ -3642,10 +3665,13 @@ static dist_status disti_field_check(dist_context *ctx, const dist_field *field,
         return disti_refuse(ctx, "%s: field.eval_fn is NULL (a failed create, or a net without a distance channel)",
                             function);
     /* beyond these squares of lengths do not fit a float, and a surface would be missed without a word */
-    if (!disti_finite_all(3, field->center) || !(field->radius >= DISTI_RADIUS_LEAST) ||
-        !(field->radius <= DISTI_RADIUS_MOST))
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.radius is %d, must be 1e-15 to 1e15, the center finite",
-                          function, (double)field->radius, 0);
+    if (!(field->radius >= DISTI_RADIUS_LEAST) || !(field->radius <= DISTI_RADIUS_MOST))
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.radius is %d, must be 1e-15 to 1e15", function,
+                          (double)field->radius, 0);
+    for (int i = 0; i < 3; i++)
+        if (!(fabsf(field->center[i]) <= DISTI_RADIUS_MOST))
+            return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.center[%d] is %d, must be within 1e15 of 0", function,
+                              i, (double)field->center[i]);
     const disti_limit limits[] = {
         {"field.lipschitz", (double)field->lipschitz, 0, 3e38}, {"field.detail", (double)field->detail, 0, 3e38},
         {"field.lipschitz_far", (double)field->lipschitz_far, 0, 3e38}, {"field.clamp", (double)field->clamp, 0, 3e38},
@@ -4020,11 +4046,11 @@ static void disti_code_end(const dist_field *field, const dist_gradients *grads,
     for (size_t j = 0; d_code && j < (size_t)field->code_size; j++) disti_add_gradient(&grads->code[j], d_code[j]);
 }
 
-DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *field, size_t n, const float *points,
-                                         float *d_sdf, dist_seed_fn seed_fn, void *seed_user, float *d_points,
-                                         const dist_gradients *grads)
+/* name: of the function that failures are told of. */
+static dist_status disti_field_backward(dist_context *ctx, const char *name, const dist_field *field, size_t n,
+                                        const float *points, float *d_sdf, dist_seed_fn seed_fn, void *seed_user,
+                                        float *d_points, const dist_gradients *grads)
 {
-    const char *name = "dist_field_backward";
     dist_status status = disti_enter(ctx);
     if (status == DIST_OK) status = disti_field_check(ctx, field, name);
     if (status == DIST_OK) status = disti_count_check(ctx, n, name);
@@ -4043,6 +4069,13 @@ DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *fi
         disti_field_backward_all(ctx, field, n, points, d_sdf, seed_fn, seed_user, d_points, d_code);
     if (status == DIST_OK) disti_code_end(field, grads, d_code);
     return status;
+}
+
+DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *field, size_t n, const float *points,
+                                         float *d_sdf, dist_seed_fn seed_fn, void *seed_user, float *d_points,
+                                         const dist_gradients *grads)
+{
+    return disti_field_backward(ctx, "dist_field_backward", field, n, points, d_sdf, seed_fn, seed_user, d_points, grads);
 }
 
 /* forward   L = w / n sum_i (|g_i| - 1)^2,  g = grad f
@@ -7049,8 +7082,9 @@ static disti_weights_job disti_weights_begin(const dist_shape *shape, size_t n, 
 }
 
 /* Points whose numbers somewhere in the net are so large that their products overflow give no weight gradient, rather
-   than spoil that of all the others: their inputs and deltas in the store become 0. */
-static void disti_weights_drop(const dist_net *net, size_t columns, float *store)
+   than spoil that of all the others: their inputs and deltas in the store become 0. channels: the store's of the last
+   layer. */
+static void disti_weights_drop(const dist_net *net, size_t columns, size_t channels, float *store)
 {
     unsigned char bad[DISTI_BLOCK];
     int any = 0;
@@ -7058,7 +7092,7 @@ static void disti_weights_drop(const dist_net *net, size_t columns, float *store
     for (int pass = 0; pass < 1 + any; pass++) {
         for (int l = 0; l < net->layers; l++) {
             const disti_linear *layer = &net->layer[l];
-            size_t rows = l + 1 == net->layers ? 1 : (size_t)layer->out, wide = (size_t)(layer->prev + layer->point);
+            size_t rows = l + 1 == net->layers ? channels : (size_t)layer->out, wide = (size_t)(layer->prev + layer->point);
             float *xt = store + disti_store_offset(net, l, DISTI_STORE_INPUT);
             float *delta = store + disti_store_offset(net, l, DISTI_STORE_DELTA);
             float *sums = store + disti_store_offset(net, l, DISTI_STORE_NORM);
@@ -7106,7 +7140,7 @@ static void disti_weights_block(void *arg, int index, int worker)
         }
         disti_encode_backward(net, &b, b.pull);
     }
-    disti_weights_drop(net, job->directions ? (size_t)DISTI_BLOCK : count, store);
+    disti_weights_drop(net, job->directions ? (size_t)DISTI_BLOCK : count, job->d_color ? 3 : 1, store);
     for (size_t i = 0; job->d_points && i < 3 * count; i++) job->d_points[3 * at + i] += b.pull[i];
     if (!job->d_code) return;
     disti_fold_begin(net, &b);
@@ -7849,7 +7883,9 @@ DIST_API dist_status dist_net_set_half(dist_context *ctx, dist_net *net, int kin
         count += disti_half_size(&net->layer[l], kind);
     if (count > 0) {
         panels = (float *)net->allocator.alloc_fn(net->allocator.user, count * sizeof(float), DISTI_ALIGNMENT);
-        if (!panels) return disti_fail(ctx, DIST_OUT_OF_MEMORY, "%s: out of memory", name, 0, 0);
+        if (!panels)
+            return disti_fail(ctx, DIST_OUT_OF_MEMORY, "%s: out of memory: %d bytes were asked for", name,
+                              (double)count * sizeof(float), 0);
     }
     dist_allocator *own = &net->allocator;
     if (net->half_panels) own->free_fn(own->user, net->half_panels, net->half_count * sizeof(float));
@@ -8076,7 +8112,8 @@ static dist_status disti_loader_shapes(disti_loader *loader)
     for (int l = 1; l < net->layers && !list; l++)
         loader->skip[l] = net->layer[l].in == net->layer[l - 1].out + net->layer[0].in;
     while (list && *list) {
-        if (!disti_scan_number(&list, &at) || at != (int)at || at < 1 || at >= net->layers || (*list && *list != ','))
+        if (!disti_scan_number(&list, &at) || !(at >= 1 && at < net->layers) || at != (int)at ||
+            (*list && *list != ','))
             return disti_loader_bad(loader, "dist.skip");
         loader->skip[(int)at] = 1;
         if (*list == ',') list++;
@@ -8563,16 +8600,24 @@ static dist_status disti_camera_check(dist_context *ctx, const dist_camera *came
     if (camera->width < 1 || camera->width > 65536 || camera->height < 1 || camera->height > 65536)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: camera is %d x %d pixels, each side must be 1 to 65536",
                           function, camera->width, camera->height);
-    if (!disti_finite(camera->fx) || !disti_finite(camera->fy) || !(camera->fx * camera->fx > 0.0f) ||
-        !(camera->fy * camera->fy > 0.0f))
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: camera.fx is %d, fy %d; must be finite and not 0", function,
-                          (double)camera->fx, (double)camera->fy);
-    if (!disti_finite(camera->cx) || !disti_finite(camera->cy) || !disti_finite(camera->skew) ||
-        !disti_finite(camera->pixel_center))
-        return disti_fail(ctx, DIST_NOT_FINITE, "%s: camera.cx, cy, skew and pixel_center must be finite", function, 0,
-                          0);
-    if (!disti_finite_all(9, camera->rotation) || !disti_finite_all(3, camera->translation))
-        return disti_fail(ctx, DIST_NOT_FINITE, "%s: camera.rotation and translation must be finite", function, 0, 0);
+    if (!disti_finite(camera->fx) || !disti_finite(camera->fy) || !(fabsf(camera->fx) > 1e-22f) ||
+        !(fabsf(camera->fy) > 1e-22f)) /* their squares are to be above 0 */
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: camera.fx is %d, fy %d; must be finite and not 0 (1e-22 at least)",
+                          function, (double)camera->fx, (double)camera->fy);
+    const float other[4] = {camera->cx, camera->cy, camera->skew, camera->pixel_center};
+    static const char *const named[4] = {"%s: camera.cx is %d, must be finite", "%s: camera.cy is %d, must be finite",
+                                         "%s: camera.skew is %d, must be finite",
+                                         "%s: camera.pixel_center is %d, must be finite"};
+    for (int i = 0; i < 4; i++)
+        if (!disti_finite(other[i]))
+            return disti_fail(ctx, DIST_NOT_FINITE, named[i], function, (double)other[i], 0);
+    for (int i = 0; i < 12; i++) {
+        float x = i < 9 ? camera->rotation[i] : camera->translation[i - 9];
+        if (disti_finite(x)) continue;
+        return disti_fail(ctx, DIST_NOT_FINITE, i < 9 ? "%s: camera.rotation[%d] is %d, must be finite"
+                                                      : "%s: camera.translation[%d] is %d, must be finite",
+                          function, i < 9 ? i : i - 9, (double)x);
+    }
     double m[9];
     for (int i = 0; i < 9; i++) m[i] = (double)camera->rotation[i];
     return disti_rotation_check(ctx, m, "%s: camera.rotation is not a rotation (rows off orthonormal by %d, "
@@ -8798,16 +8843,22 @@ static dist_status disti_how_check(dist_context *ctx, const dist_render_desc *ho
         {"how.inside", (double)how->inside, 0, DIST_INSIDE_EXIT}, {"how.no_cones", (double)how->no_cones, 0, 1},
         {"how.no_prediction", (double)how->no_prediction, 0, 1}, {"how.certified", (double)how->certified, 0, 1},
         {"how.any_hit", (double)how->any_hit, 0, 1}, {"how.max_distance", (double)how->max_distance, 0, any},
-        {"how.warm_start", (double)how->warm_start, 0, how->trace == DIST_TRACE_GUARDED ? 1.0 : 0.0},
+        {"how.warm_start", (double)how->warm_start, 0, 1},
         {"how.step_scale", (double)how->step_scale, 0, 100}, {"how.epsilon", (double)how->epsilon, 0, any},
         {"how.gradient_cap", (double)how->gradient_cap, 0, 1},
         {"how.normal_delta", (double)how->normal_delta, 0, any}, {"how.lipschitz", (double)how->lipschitz, 0, any},
         {"how.relax_band", (double)how->relax_band, 0, any}};
     dist_status status = disti_limits(ctx, function, sizeof limits / sizeof limits[0], limits);
     if (status != DIST_OK) return status;
-    if (!disti_finite(how->background) || !disti_finite_all(3, how->background_color))
-        return disti_fail(ctx, DIST_NOT_FINITE, "%s: how.background and background_color must be finite", function, 0,
-                          0);
+    if (how->warm_start && how->trace != DIST_TRACE_GUARDED)
+        return disti_refuse(ctx, "%s: how.warm_start is for DIST_TRACE_GUARDED, must be 0", function);
+    if (!disti_finite(how->background))
+        return disti_fail(ctx, DIST_NOT_FINITE, "%s: how.background is %d, must be finite", function,
+                          (double)how->background, 0);
+    for (int i = 0; i < 3; i++)
+        if (!disti_finite(how->background_color[i]))
+            return disti_fail(ctx, DIST_NOT_FINITE, "%s: how.background_color[%d] is %d, must be finite", function, i,
+                              (double)how->background_color[i]);
 #ifdef DIST_NO_PAPER
     if (how->trace == DIST_TRACE_PAPER)
         return disti_fail(ctx, DIST_UNSUPPORTED, "%s: this build has DIST_NO_PAPER, so no DIST_TRACE_PAPER", function,
@@ -10035,7 +10086,7 @@ static void disti_free_task(void *arg, int index, int worker)
         const disti_ray *ray = &bench.rays[i];
         dist_hit *hit = job->hits + first + i;
         disti_stats_ray(job->tracer, ray, bench.stats);
-        hit->distance = (float)(ray->base + (double)ray->best);
+        hit->distance = disti_within_float(ray->base + (double)ray->best);
         hit->error = disti_ray_bound(job->tracer, ray);
         hit->sdf = ray->fbest;
         hit->status = ray->status;
@@ -10052,9 +10103,12 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
     if (status == DIST_OK) status = disti_tracer_init(&tracer, ctx, field, how, "dist_trace");
     if (status != DIST_OK) return status;
     if (n > 0 && (!origins || !directions || !hits))
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_trace: origins, directions or hits is NULL", NULL, 0, 0);
+        return disti_refuse(ctx, "dist_trace: %s is NULL", !origins ? "origins" : !directions ? "directions" : "hits");
     if (tracer.how.pixels)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_trace: how.pixels is for pictures, must be NULL", NULL, 0, 0);
+    if (tracer.how.trace != DIST_TRACE_GUARDED || tracer.how.warm_start)
+        return disti_refuse(ctx, "dist_trace: how.%s is for pictures, must be 0",
+                            tracer.how.warm_start ? "warm_start" : "trace DIST_TRACE_PAPER");
     disti_stats_begin(ctx);
     disti_free_job job = {&tracer, n, origins, directions, hits};
     disti_run(ctx, (int)((n + DISTI_FREE_RAYS - 1) / DISTI_FREE_RAYS), disti_free_task, &job);
@@ -10091,8 +10145,8 @@ static float disti_foot_length(const float d[3])
 /* Moves x by `step` times n and keeps it in the bounding sphere. Returns how far out it would have been. */
 static float disti_foot_move(const dist_field *field, float *x, const float *n, float step)
 {
-    const float *c = field->center;
-    for (int i = 0; i < 3; i++) x[i] += step * n[i];
+    const float *c = field->center, most = 4.0f * field->radius; /* beyond that nothing is new: it comes back */
+    for (int i = 0; i < 3; i++) x[i] += DISTI_MIN(DISTI_MAX(step * n[i], -most), most);
     float d[3] = {x[0] - c[0], x[1] - c[1], x[2] - c[2]}, length = disti_foot_length(d);
     for (int i = 0; i < 3 && length > field->radius; i++) x[i] = c[i] + (x[i] - c[i]) / length * field->radius;
     return DISTI_MAX(length - field->radius, 0.0f);
@@ -10226,8 +10280,10 @@ static void disti_foot_task(void *arg, int index, int worker)
             if (foot->status == DIST_RAY_HIT && !(contact->depth > 0.0f)) foot->status = DIST_RAY_MISS;
             if (foot->status == DIST_RAY_NOT_FINITE) contact->depth = 0.0f;
             memcpy(contact->normal, foot->status == DIST_RAY_HIT ? foot->normal : zero, sizeof contact->normal);
-            for (size_t k = 0; k < 3 && foot->status == DIST_RAY_HIT && foot->distance > 1e-3f * field->radius; k++)
-                contact->normal[k] = foot->sign * (foot->p[k] - foot->best[k]) / foot->distance; /* right at an edge */
+            double away[3];
+            for (size_t k = 0; k < 3; k++) away[k] = (double)foot->p[k] - (double)foot->best[k];
+            int far = foot->status == DIST_RAY_HIT && foot->distance > 1e-3f * field->radius && disti_normalize(away);
+            for (size_t k = 0; k < 3 && far; k++) contact->normal[k] = foot->sign * (float)away[k]; /* right at an edge */
             memcpy(contact->point, foot->best, sizeof contact->point);
             contact->status = foot->status;
             continue;
@@ -10245,8 +10301,9 @@ static dist_status disti_foot_run(disti_foot_job *job, const char *function, con
     if (status == DIST_OK) status = disti_count_check(job->ctx, job->n, function);
     if (status != DIST_OK) return status;
     if (job->n > 0 && (!job->points || !out))
-        return disti_fail(job->ctx, DIST_BAD_ARGUMENT, "%s: points, spheres or the array for the answers is NULL",
-                          function, 0, 0);
+        return disti_refuse(job->ctx, !out            ? "%s: the array for the answers is NULL"
+                                      : job->contacts ? "%s: spheres is NULL"
+                                                      : "%s: points is NULL", function);
     for (size_t i = 0; i < job->n && job->contacts; i++)
         if (job->points[4 * i + 3] < 0.0f)
             return disti_fail(job->ctx, DIST_BAD_ARGUMENT, "%s: the radius of sphere %d is %d, must be 0 or positive",
@@ -10575,11 +10632,11 @@ static int disti_cones(const disti_tracer *tracer, int worker, const disti_tile 
     return blocked;
 }
 
-/* Prediction between neighbors: every 8th pixel (of large pixels every 4th or 2nd: disti_render_lattice) is marched,
-   then the pixels half way between known ones, three times over. 1 / z is linear over a plane, so the distance is interpolated in it, from four collinear hits (-1, 9, 9, -1)
-   / 16 where they are near each other, else from two; most pixels then need one query. Two checks keep what is in
-   front from being missed: no prediction across a miss or a jump in depth; and f where the cones stopped must not be
-   smaller than the predicted surface alone would make it, or something else is near. */
+/* Prediction between neighbors: every 8th pixel (of large pixels every 4th: disti_render_lattice) is marched, then the pixels half way between known ones, three times over. 1 / z is linear over a plane, so the distance is
+   interpolated in it, from four collinear hits (-1, 9, 9, -1) / 16 where they are near each other, else from two; most
+   pixels then need one query. Two checks keep what is in front from being missed: no prediction across a miss or a jump
+   in depth; and f where the cones stopped must not be smaller than the predicted surface alone would make it, or
+   something else is near. */
 enum { DISTI_LATTICE = 8 };
 
 /* Depth of the hit `shift` pixels along one axis; 0 where there is none. */
@@ -11650,15 +11707,16 @@ static float disti_ray_silhouette(const disti_tracer *tracer, const disti_ray *r
     float tiny = 1e-3f * tracer->noise;
     if (ray->enter >= ray->leave) {
         double nearest[3], away[3];
-        float off = (float)(disti_ray_nearest(field, ray, nearest, away) - (double)field->radius);
-        return DISTI_MAX(off, tiny);
+        float off = disti_within_float(disti_ray_nearest(field, ray, nearest, away) - (double)field->radius);
+        return DISTI_MIN(DISTI_MAX(off, tiny), 3e38f);
     }
     float f = ray->fbest, magnitude = f < 0.0f ? -f : f;
     float epsilon = disti_ray_epsilon(tracer, ray, ray->best);
     if (ray->status == DIST_RAY_NOT_FINITE) return epsilon;
     if (disti_ray_is_hit(tracer, ray))
         return DISTI_MIN((tracer->how.trace == DIST_TRACE_PAPER ? f : magnitude) - epsilon, -tiny);
-    if (magnitude > 2e38f) return tracer->lipschitz * field->radius; /* no sample: no more is known than this bound */
+    if (magnitude > 2e38f) /* no sample: no more is known than this bound */
+        return (float)DISTI_MIN((double)tracer->lipschitz * (double)field->radius, 3e38);
     return DISTI_MAX(magnitude - epsilon, tiny);
 }
 
@@ -12812,15 +12870,14 @@ static double disti_view_away(const disti_view *view, const dist_field *field)
     return sqrt(disti_dot(away, away));
 }
 
-/* Neighbors say something about each other where they are near each other: the lattice is 8 pixels wide, but no wider
-   than .08 of the radius, so that large pixels lose no more of what is thin; from .04 on none is predicted. */
+/* Neighbors say something about each other where pixels are below a 50th of the radius. The lattice is 8 of them wide,
+   but no wider than .08 of the radius, so that large pixels lose no more of what is thin. */
 static int disti_render_lattice(const disti_tracer *tracer, const disti_view *view)
 {
-    double f = DISTI_MIN(fabs(view->fx), fabs(view->fy)), block = 0.08 * (double)tracer->field->radius * f;
-    int lattice = DISTI_LATTICE;
+    double f = DISTI_MIN(fabs(view->fx), fabs(view->fy));
+    double pixel = disti_view_away(view, tracer->field) / f / (double)tracer->field->radius;
     if (tracer->how.trace != DIST_TRACE_GUARDED || tracer->how.no_cones || tracer->how.no_prediction) return 0;
-    while (lattice > 1 && !(disti_view_away(view, tracer->field) * lattice < block)) lattice /= 2;
-    return lattice > 1 ? lattice : 0;
+    return pixel < 0.01 ? (int)DISTI_LATTICE : pixel < 0.02 ? (int)DISTI_LATTICE / 2 : 0;
 }
 
 /* Mean |f| at up to 1024 of the tape's hits, at most one in 16, evenly over the picture: how much has changed. 3e38: it
@@ -13462,7 +13519,7 @@ static float disti_loss_absolute(size_t n, size_t channels, const float *x, cons
         for (size_t k = channels * i; k < channels * (i + 1); k++)
             d_x[k] += (float)(scale * disti_sign((double)x[k] - (double)target[k]));
     }
-    return (float)(scale * sum);
+    return disti_within_float(scale * sum);
 }
 
 DIST_API float dist_loss_depth(size_t n, const float *depth, const float *target, const unsigned char *mask,
@@ -13534,7 +13591,7 @@ static float disti_loss_silhouette(size_t n, const float *silhouette, const unsi
         if (target[i] && silhouette[i] > 0.0f) d_silhouette[i] += (float)scale[1];
         if (!target[i] && silhouette[i] < 0.0f) d_silhouette[i] -= (float)scale[0];
     }
-    return (float)(scale[0] * sum[0] + scale[1] * sum[1]);
+    return disti_within_float(scale[0] * sum[0] + scale[1] * sum[1]);
 }
 
 DIST_API float dist_loss_silhouette(size_t n, const float *silhouette, const unsigned char *target, float weight,
@@ -13558,9 +13615,9 @@ DIST_API float dist_loss_code(size_t n, const float *code, float weight, float *
     for (size_t j = 0; j < n; j++) {
         if (!disti_finite(code[j])) continue;
         sum += (double)code[j] * (double)code[j];
-        if (d_code) d_code[j] += (float)(2.0 * (double)weight * (double)code[j]);
+        if (d_code) disti_add_gradient(&d_code[j], 2.0 * (double)weight * (double)code[j]);
     }
-    return (float)((double)weight * sum);
+    return disti_within_float((double)weight * sum);
 }
 
 /* Photometric loss. One pixel's way from view `to` into view `from`, with r its ray of depth 1:
@@ -13791,9 +13848,9 @@ DIST_API float dist_loss_photometric(const dist_photo *to, const dist_photo *fro
     if (d_depth || d_cameras) {
         memset(d_pose, 0, sizeof d_pose);
         disti_warp_sweep(&pair, NULL, scale, again, d_depth, d_pose);
-        for (int i = 0; d_cameras && i < 12; i++) d_cameras[i] += (float)d_pose[i];
+        for (int i = 0; d_cameras && i < 12; i++) disti_add_gradient(&d_cameras[i], d_pose[i]);
     }
-    return (float)(scale[0] * sum[0] + scale[1] * sum[2]);
+    return disti_within_float(scale[0] * sum[0] + scale[1] * sum[2]);
 }
 
 /*@ 10 optimizer ---------------------------------------------------------------------------------------------------- */
@@ -13827,7 +13884,7 @@ DIST_API size_t dist_adam_step(dist_adam *adam, size_t n, float *x, const float 
         first[i] = (float)m;
         second[i] = (float)root;
         double step = rate * (m / correction1) / (root / correction2 + epsilon);
-        if (rate > 0.0) x[i] = (float)((double)x[i] - step);
+        if (rate > 0.0 && disti_finite(x[i])) x[i] = disti_within_float((double)x[i] - step);
     }
     return skipped;
 }
@@ -13899,11 +13956,12 @@ static int disti_mesh_add_triangle(dist_mesh *mesh, unsigned a, unsigned b, unsi
 }
 
 /* 0 after disti_fail if a triangle has a vertex that is not there. */
-static int disti_mesh_check(const dist_mesh *mesh, dist_status status, const char *format, const char *text)
+static int disti_mesh_check(dist_context *ctx, const dist_mesh *mesh, dist_status status, const char *format,
+                            const char *text)
 {
     for (size_t i = 0; i < 3 * mesh->triangle_count; i++) {
         if (mesh->triangles[i] < mesh->vertex_count) continue;
-        disti_fail(mesh->owner, status, format, text, (double)mesh->triangles[i], (double)mesh->vertex_count);
+        disti_fail(ctx, status, format, text, (double)mesh->triangles[i], (double)mesh->vertex_count);
         return 0;
     }
     return 1;
@@ -13933,7 +13991,7 @@ DIST_API dist_mesh *dist_mesh_create(dist_context *ctx, size_t vertex_count, con
     for (size_t i = 0; good && i < triangle_count; i++)
         good = disti_mesh_add_triangle(mesh, triangles[3 * i], triangles[3 * i + 1], triangles[3 * i + 2]);
     const char *format = "dist_mesh_create: a triangle has vertex %d, must be below %d";
-    if (good && disti_mesh_check(mesh, DIST_BAD_ARGUMENT, format, NULL)) return mesh;
+    if (good && disti_mesh_check(ctx, mesh, DIST_BAD_ARGUMENT, format, NULL)) return mesh;
     dist_mesh_destroy(mesh);
     return NULL;
 }
@@ -14352,6 +14410,7 @@ DIST_API dist_status dist_mesh_backward(dist_context *ctx, const dist_field *fie
                                         const float *d_vertices, const dist_gradients *grads)
 {
     enum { CHUNK = 4096 };
+    const char *name = "dist_mesh_backward";
     float d_sdf[CHUNK];
     dist_status status = disti_enter(ctx);
     if (status != DIST_OK) return status;
@@ -14359,9 +14418,8 @@ DIST_API dist_status dist_mesh_backward(dist_context *ctx, const dist_field *fie
         return disti_refuse(ctx, "dist_mesh_backward: %s is NULL", mesh ? "d_vertices" : "mesh");
     for (size_t i = 0; i < mesh->vertex_count; i++)
         if (!disti_finite_all(3, d_vertices + 3 * i))
-            return disti_fail(ctx, DIST_NOT_FINITE, "dist_mesh_backward: d_vertices of vertex %d is not finite", NULL,
-                              (double)i, 0);
-    status = dist_field_backward(ctx, field, 0, NULL, NULL, NULL, NULL, NULL, grads);
+            return disti_fail(ctx, DIST_NOT_FINITE, "%s: d_vertices of vertex %d is not finite", name, (double)i, 0);
+    status = disti_field_backward(ctx, name, field, 0, NULL, NULL, NULL, NULL, NULL, grads);
     for (size_t at = 0; status == DIST_OK && at < mesh->vertex_count; at += CHUNK) {
         const float *d_chunk = d_vertices + 3 * at, *points = mesh->vertices + 3 * at;
         size_t n = DISTI_MIN(mesh->vertex_count - at, (size_t)CHUNK);
@@ -14370,8 +14428,8 @@ DIST_API dist_status dist_mesh_backward(dist_context *ctx, const dist_field *fie
             disti_field_eval_all(ctx, field, n, points, d_sdf, gradient);
             disti_mesh_seed(&d_chunk, 0, n, NULL, gradient, d_sdf);
         }
-        status = dist_field_backward(ctx, field, n, points, d_sdf, grads->weights ? NULL : disti_mesh_seed, &d_chunk,
-                                     NULL, grads);
+        status = disti_field_backward(ctx, name, field, n, points, d_sdf, grads->weights ? NULL : disti_mesh_seed,
+                                      &d_chunk, NULL, grads);
     }
     return status;
 }
@@ -14413,7 +14471,7 @@ DIST_API dist_status dist_mesh_sample(dist_context *ctx, const dist_mesh *mesh, 
     if (status != DIST_OK) return status;
     if (!mesh || (n && !points)) return disti_refuse(ctx, "dist_mesh_sample: %s is NULL", mesh ? "points" : "mesh");
     if (count == 0) return disti_refuse(ctx, "%s: the mesh has no triangles", name);
-    if (!disti_mesh_check(mesh, DIST_BAD_ARGUMENT, "%s: a triangle has vertex %d, must be below %d", name))
+    if (!disti_mesh_check(ctx, mesh, DIST_BAD_ARGUMENT, "%s: a triangle has vertex %d, must be below %d", name))
         return DIST_BAD_ARGUMENT;
     disti_size_mul(count, sizeof(double), &bytes);
     double *until = (double *)disti_alloc(ctx, bytes); /* area of the triangles up to and with this one */
@@ -14971,6 +15029,13 @@ static int disti_off_number(disti_mesh_text *r, double *out)
     return disti_mesh_fail(r, DIST_BAD_FILE, "truncated, or not a number", 0);
 }
 
+/* 0 after disti_fail where a count in the file is none. */
+static int disti_mesh_read_count(disti_mesh_text *r, double count)
+{
+    if (count >= 0.0 && count < 4294967296.0 && count == floor(count)) return 1;
+    return disti_mesh_fail(r, DIST_BAD_FILE, "%d is no count, must be a whole number from 0 to 4294967295", count);
+}
+
 /* What follows the numbers on a line (normals, colors) is left out. */
 static int disti_read_off(disti_mesh_text *r)
 {
@@ -14978,7 +15043,8 @@ static int disti_read_off(disti_mesh_text *r)
     disti_skip_blank(&r->text);
     if (r->text.end - r->text.at >= 6 && memcmp(r->text.at, "BINARY", 6) == 0)
         return disti_mesh_fail(r, DIST_UNSUPPORTED, "binary OFF is not supported", 0);
-    if (!disti_off_number(r, counts) || !disti_off_number(r, counts + 1)) return 0;
+    for (int i = 0; i < 2; i++)
+        if (!disti_off_number(r, counts + i) || !disti_mesh_read_count(r, counts[i])) return 0;
     disti_skip_line(&r->text);
     for (double i = 0.0; i < counts[0]; i += 1.0) {
         for (int k = 0; k < 3; k++)
@@ -14987,7 +15053,7 @@ static int disti_read_off(disti_mesh_text *r)
         disti_skip_line(&r->text);
     }
     for (double i = 0.0; i < counts[1]; i += 1.0) {
-        if (!disti_off_number(r, &corners)) return 0;
+        if (!disti_off_number(r, &corners) || !disti_mesh_read_count(r, corners)) return 0;
         for (size_t k = 0; (double)k < corners; k++)
             if (!disti_off_number(r, &index) || !disti_mesh_read_corner(r, k, index)) return 0;
         disti_skip_line(&r->text);
@@ -15137,7 +15203,7 @@ static int disti_ply_item(disti_mesh_text *r, const disti_ply *ply, const disti_
                 return 0;
             continue;
         }
-        if (!disti_ply_value(r, ply, p->count_type, &count)) return 0;
+        if (!disti_ply_value(r, ply, p->count_type, &count) || !disti_mesh_read_count(r, count)) return 0;
         for (size_t k = 0; (double)k < count; k++) {
             if (p->role != DISTI_PLY_INDICES) {
                 if (!disti_ply_skip(r, ply, p->type)) return 0;
@@ -15186,7 +15252,7 @@ static dist_mesh *disti_mesh_parse(dist_context *ctx, const char *label, const v
         good = off ? disti_read_off(&r) : disti_read_obj(&r);
     }
     const char *format = "dist_mesh_read (%s): a face has vertex %d, must be below %d";
-    if (good && disti_mesh_check(r.mesh, DIST_BAD_FILE, format, label)) return r.mesh;
+    if (good && disti_mesh_check(ctx, r.mesh, DIST_BAD_FILE, format, label)) return r.mesh;
     dist_mesh_destroy(r.mesh);
     return NULL;
 }
@@ -15273,6 +15339,8 @@ DIST_API dist_status dist_mesh_write(dist_context *ctx, const dist_mesh *mesh, i
         if (!disti_finite_all(3, mesh->vertices + 3 * i) ||
             (mesh->normals && !disti_finite_all(3, mesh->normals + 3 * i)))
             return disti_fail(ctx, DIST_NOT_FINITE, "%s: vertex %d is not finite", name, (double)i, 0);
+    if (!disti_mesh_check(ctx, mesh, DIST_BAD_ARGUMENT, "%s: a triangle has vertex %d, must be below %d", name))
+        return DIST_BAD_ARGUMENT;
     for (int pass = 0; pass < 2; pass++) { /* counts, then writes */
         if (format == DIST_MESH_PLY) disti_write_ply(&sink, mesh);
         else disti_write_obj(&sink, mesh);
@@ -15412,7 +15480,15 @@ DIST_API size_t dist_workspace_bytes(const dist_workspace_desc *desc)
     memset(&m, 0, sizeof m);
     if (desc) d = *desc;
     if (d.context) context = *d.context;
-    if (!disti_allocator_of(&context, &m.allocator)) memset(&m.allocator, 0, sizeof m.allocator);
+    if (!disti_allocator_of(&context, &m.allocator)) {
+        memset(&m.allocator, 0, sizeof m.allocator);
+        if (context.allocator.alloc_fn || context.allocator.free_fn) {
+            memset(&ctx, 0, sizeof ctx);
+            ctx.logger = context.logger;
+            disti_refuse(&ctx, "%s: context.allocator has one function of two", name);
+            return 0;
+        }
+    }
     disti_measure_alloc(&m, sizeof ctx, DISTI_ALIGNMENT);
     dist_status status = disti_context_begin(&ctx, &context, &counting);
     if (status == DIST_OK && d.model) status = disti_measure_net(&ctx, &m, d.model, d.model_size, &net);

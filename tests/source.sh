@@ -41,7 +41,7 @@ while IFS=: read -r line text; do
 done <"$work/calls"
 expect_nothing libc_allocator_only_in_the_default_hook "$work/found"
 
-grep -n -E '^[ ]*#[ ]*include' "$work/code" | grep -v -E '<(stddef|math|stdint|stdlib|string|stdio|([a-z0-9]*)intrin|arm_neon)\.h>' \
+grep -n -E '^[ ]*#[ ]*include' "$work/code" | grep -v -E '<(stddef|fenv|math|stdint|stdlib|string|stdio|([a-z0-9]*)intrin|arm_neon)\.h>' \
     >"$work/found"
 expect_nothing only_the_allowed_includes "$work/found"
 

@@ -154,8 +154,8 @@ typedef struct dist_context_desc {
     int blas_width; /* 0: 128 */
 } dist_context_desc;
 
-/* desc may be NULL. Returns NULL only if memory cannot be had; any other failure (a refused hook) comes back as a
-   context whose status says so and with which every further call fails with that status. */
+/* desc may be NULL. Returns NULL only if memory cannot be had or half of an allocator is given; any other failure (a
+   refused hook) comes back as a context whose status says so and with which every further call fails with that status. */
 DIST_API dist_context *dist_context_create(const dist_context_desc *desc);
 DIST_API void dist_context_destroy(dist_context *ctx);
 
@@ -320,7 +320,8 @@ DIST_API dist_status dist_scene_set(dist_scene *scene, int index, const dist_ins
 /* The scene as a field. Borrows the scene. No gradient for weights. Its code is, for each instance, its field's code
    (nothing if that has no adjoint), then its placement as dist_similarity_move has it: log-scale, w of
    R' = exp([w]x) R, translation; dist_gradients.code gets the gradients for all of them. It has a color if every
-   instance has, with an adjoint if each has one; its color code is theirs one after another. */
+   instance has, with an adjoint if each has one; its color code is theirs one after another. The gradient of its
+   normals is that of differences over how.normal_delta, of smooth nets, too. */
 DIST_API dist_field dist_scene_field(dist_scene *scene);
 /* Where instance `index` begins in the scene's code; its placement are the seven numbers before instance index + 1.
    index = count: all of them. -1 out of range. */
@@ -394,8 +395,8 @@ typedef struct dist_net_desc {
     int layers;       /* hidden layers, 1 to 31; 0: 8 */
     int width;        /* units of each, 1 to 4096; 0: 512 */
     int skip;         /* linear layer 1..layers-1 that sees [x, input] again; 0: none */
-    int code_size;    /* 0: none */
-    int code_count;   /* codes stored beside the weights, zero at first */
+    int code_size;    /* at most 4096; 0: none */
+    int code_count;   /* codes stored beside the weights, zero at first; at most 10,000,000 */
     int activation;   /* DIST_ACTIVATION_* */
     float scale;      /* beta of softplus, omega of sine, 1e-6 to 1e6; 0: 100, 30 */
     int output_linear;/* 0: tanh at the end, 1: nothing */
@@ -413,11 +414,13 @@ DIST_API dist_status dist_net_set_weights(dist_context *ctx, dist_net *net, cons
 DIST_API dist_status dist_net_set_code(dist_context *ctx, dist_net *net, int index, const float *code);
 #endif
 
-/* code (dist_net_code_size) is copied; NULL means zeros. The net is borrowed until the shape is destroyed. */
+/* code (dist_net_code_size) is copied; NULL means zeros: so does dist_net_code of an index that is not there. The net
+   is borrowed until the shape is destroyed. */
 DIST_API dist_shape *dist_shape_create(dist_context *ctx, const dist_net *net, const float *code);
 DIST_API void dist_shape_destroy(dist_shape *shape);
 /* Fields and scenes of the shape have the new code at once. Their Lipschitz figures and coarse_error stay those that
-   dist_shape_create sampled: make a new shape where code or weights have come far. */
+   dist_shape_create sampled: what is thin, and how.certified, ask for a new shape where code or weights have come
+   far. */
 DIST_API dist_status dist_shape_set_code(dist_shape *shape, const float *code);
 /* Color by a second net: rgb = g(code, color code, point), where g's code is the shape's followed by the color's; so
    dist_net_code_size(texture) is at least the shape's, and the rest is field.color_code_size. color_code is copied;
@@ -428,7 +431,7 @@ DIST_API dist_status dist_shape_set_color_code(dist_shape *shape, const float *c
 /* The field of the net's distance channel. Borrows the shape. A net without one (r,g,b) gives a field that render
    refuses. */
 DIST_API dist_field dist_shape_field(dist_shape *shape);
-/* All output channels (n, dist_net_channels) at n points. */
+/* All output channels (n, dist_net_channels) at n points; the distance's is f, so dist.level is off it. */
 DIST_API dist_status dist_shape_eval(dist_context *ctx, dist_shape *shape, size_t n, const float *points,
                                      float *channels);
 
@@ -484,16 +487,16 @@ enum {
 };
 
 typedef struct dist_render_desc {
-    int max_steps;       /* queries per ray at most; 0: 100 guarded, 1000 certified, 50 paper */
-    float step_scale;    /* alpha; 0: 1.5 (paper: rows aggressive and coarse-to-fine). Above 0 */
+    int max_steps;       /* queries per ray at most, to 60000; 0: 100 guarded, 1000 certified, 50 paper */
+    float step_scale;    /* alpha, above 0, to 100; 0: 1.5 (paper: rows aggressive and coarse-to-fine) */
     float epsilon; /* largest |f| of a hit, shape units, which those interpolated between hits alike may exceed; 0: 5e-5
                       of the bounding radius or field.detail, or less where a pixel is smaller (paper: 5e-5). The
                       guarded tracer takes at most half of field.clamp */
     int samples;         /* K of the paper's gradient, 1 to 8; 0: 1 */
-    int trace;           /* DIST_TRACE_* */
+    int trace;           /* DIST_TRACE_*; dist_trace: 0 */
     int paper_row;       /* DIST_PAPER_* */
     int gradient;        /* DIST_GRADIENT_*; AUTO: IMPLICIT with the guarded tracer, PAPER with the paper's */
-    float gradient_cap;  /* tau: |grad f . v| counts as at least tau |grad f|; 0: 0.1 */
+    float gradient_cap;  /* tau, to 1: |grad f . v| counts as at least tau |grad f|; 0: 0.1 */
     int normal_mode;     /* DIST_NORMAL_* */
     float normal_delta;  /* half step of differences, shape units; 0: 1e-3 of the bounding radius or field.detail */
     int normal_space;    /* DIST_SPACE_* */
@@ -514,7 +517,7 @@ typedef struct dist_render_desc {
        looks, in lengths of its direction (1: from origin to origin + direction); 0: without end */
     int any_hit;
     float max_distance;
-    int warm_start;      /* 1: start from the picture in the tape, see dist_tape_create; guarded tracer */
+    int warm_start;      /* 1: start from the picture in the tape, see dist_tape_create; guarded tracer, pictures */
     /* (height, width): only pixels that are not 0 are traced. Read during dist_render; NULL: all. dist_trace: NULL */
     const unsigned char *pixels;
     unsigned long long max_queries; /* queries of one call at most; 0: no limit. Shared out over the tiles by their
@@ -548,7 +551,7 @@ typedef struct dist_stats {
     float error;                        /* largest error over the hits; see dist_images.error */
 } dist_stats;
 
-/* One free ray's result. Distances are along the unit direction. */
+/* One free ray's result. Distances are along the unit direction, how.max_distance is in lengths of the one given. */
 typedef struct dist_hit {
     float distance; /* of the hit, or of the sample of smallest |f|; a ray without one: nearest to the center */
     float error;    /* bound on the distance's error, as good as f's slopes are sampled; no neighbors are asked */
@@ -593,7 +596,10 @@ typedef struct dist_images {
     float *depth;          /* z in camera space; how.background where the ray is neither a hit nor UNRESOLVED */
     float *distance;       /* along the ray; likewise */
     float *normal;         /* (h, w, 3), unit, outward; 0 at a miss */
-    float *silhouette;     /* min |f| along the ray - epsilon, signed: < 0 at a hit, > 0 at a miss */
+    float *silhouette;     /* min |f| along the ray - epsilon, signed: < 0 at a hit, > 0 at a miss. Far from the
+                              outline, from |f| of about .05 of the radius on, in coarse pictures from more, it is
+                              interpolated or another local minimum; of a ray beside the bounding sphere its distance
+                              from that */
     float *color;          /* (h, w, 3); how.background_color at a miss and where it is not finite */
     unsigned char *mask;   /* 1 hit, 0 not: the authority */
     unsigned char *status; /* DIST_RAY_* */
@@ -633,9 +639,9 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
                                  const dist_render_desc *desc, const dist_images *out, dist_tape *tape);
 
 #ifndef DIST_NO_BACKWARD
-/* Adjoint of the dist_render that filled the tape: reads d_out's depth, distance, normal, silhouette, color; adds to
-   grads; with how.relax_band color also at misses: outlines move, though not those that lie before another surface.
-   What is not finite in d_out counts as 0. d_out->stats, if given, gets capped, backward_points and skipped added. No
+/* Adjoint of the dist_render that filled the tape: reads d_out's depth, distance, normal, color, and silhouette if that
+   was rendered; adds to grads; with how.relax_band color also at misses: outlines move, though not those that lie
+   before another surface. What is not finite in d_out counts as 0. d_out->stats, if given, gets capped, backward_points and skipped added. No
    allocator call. */
 DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *tape, const dist_images *d_out,
                                           const dist_gradients *grads);
@@ -734,7 +740,8 @@ typedef struct dist_mesh_desc {
     int refine;     /* Newton steps that move vertices onto the surface, 0 to 8 */
 } dist_mesh_desc;
 
-/* f = level within the field's bounding sphere's cube: closed unless the surface leaves the cube. An empty surface is a
+/* f = level within the field's bounding sphere's cube: closed unless the surface leaves the cube or, without no_skip,
+   the Lipschitz figure, which of nets is a sample, rules out a cell that it goes through. An empty surface is a
    mesh of no triangles, not an error. NULL on failure. */
 DIST_API dist_mesh *dist_mesh_extract(dist_context *ctx, const dist_field *field, const dist_mesh_desc *desc);
 /* Copies the arrays; an index out of range or a vertex that is not finite is refused. */
@@ -777,7 +784,7 @@ DIST_API void dist_pfm_free(dist_context *ctx, float *pixels, int width, int hei
 
 #ifndef DIST_NO_MESH
 /* Mesh files in memory. read: PLY (ascii, binary little-endian; triangles and polygons), OBJ (v, f; polygons
-   fanned), OFF; told apart by their first bytes. write: PLY binary, or OBJ. */
+   fanned), OFF; told apart by their first bytes; normals are left out. write: PLY binary, or OBJ. */
 enum { DIST_MESH_PLY = 0, DIST_MESH_OBJ = 1 };
 DIST_API dist_mesh *dist_mesh_read(dist_context *ctx, const void *bytes, size_t size);
 DIST_API dist_status dist_mesh_write(dist_context *ctx, const dist_mesh *mesh, int format, void *buffer,
@@ -807,7 +814,8 @@ typedef struct dist_workspace_desc {
    each rounded up to one, and takes nothing back: exactly; with one less some create function fails with
    DIST_OUT_OF_MEMORY. The create functions' own code is run without memory. dist_net_load_file needs its file's bytes
    besides, meshes and Chamfer distance theirs.
-   0: a create function would refuse; desc->context->logger is told why. The table of contents of a model is read into
+   0: a create function would refuse (but for weights that are not finite, which are not looked at);
+   desc->context->logger is told why. The table of contents of a model is read into
    memory of desc->context->allocator, or malloc's, and given back. */
 DIST_API size_t dist_workspace_bytes(const dist_workspace_desc *desc);
 
@@ -4075,7 +4083,8 @@ DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *fi
                                          float *d_sdf, dist_seed_fn seed_fn, void *seed_user, float *d_points,
                                          const dist_gradients *grads)
 {
-    return disti_field_backward(ctx, "dist_field_backward", field, n, points, d_sdf, seed_fn, seed_user, d_points, grads);
+    const char *name = "dist_field_backward";
+    return disti_field_backward(ctx, name, field, n, points, d_sdf, seed_fn, seed_user, d_points, grads);
 }
 
 /* forward   L = w / n sum_i (|g_i| - 1)^2,  g = grad f
@@ -7092,7 +7101,8 @@ static void disti_weights_drop(const dist_net *net, size_t columns, size_t chann
     for (int pass = 0; pass < 1 + any; pass++) {
         for (int l = 0; l < net->layers; l++) {
             const disti_linear *layer = &net->layer[l];
-            size_t rows = l + 1 == net->layers ? channels : (size_t)layer->out, wide = (size_t)(layer->prev + layer->point);
+            size_t rows = l + 1 == net->layers ? channels : (size_t)layer->out;
+            size_t wide = (size_t)(layer->prev + layer->point);
             float *xt = store + disti_store_offset(net, l, DISTI_STORE_INPUT);
             float *delta = store + disti_store_offset(net, l, DISTI_STORE_DELTA);
             float *sums = store + disti_store_offset(net, l, DISTI_STORE_NORM);
@@ -8602,7 +8612,8 @@ static dist_status disti_camera_check(dist_context *ctx, const dist_camera *came
                           function, camera->width, camera->height);
     if (!disti_finite(camera->fx) || !disti_finite(camera->fy) || !(fabsf(camera->fx) > 1e-22f) ||
         !(fabsf(camera->fy) > 1e-22f)) /* their squares are to be above 0 */
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: camera.fx is %d, fy %d; must be finite and not 0 (1e-22 at least)",
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: camera.fx is %d, fy %d; must be finite and not 0 (1e-22 at "
+                                                  "least)",
                           function, (double)camera->fx, (double)camera->fy);
     const float other[4] = {camera->cx, camera->cy, camera->skew, camera->pixel_center};
     static const char *const named[4] = {"%s: camera.cx is %d, must be finite", "%s: camera.cy is %d, must be finite",
@@ -10283,7 +10294,8 @@ static void disti_foot_task(void *arg, int index, int worker)
             double away[3];
             for (size_t k = 0; k < 3; k++) away[k] = (double)foot->p[k] - (double)foot->best[k];
             int far = foot->status == DIST_RAY_HIT && foot->distance > 1e-3f * field->radius && disti_normalize(away);
-            for (size_t k = 0; k < 3 && far; k++) contact->normal[k] = foot->sign * (float)away[k]; /* right at an edge */
+            for (size_t k = 0; k < 3 && far; k++) /* right at an edge, too */
+                contact->normal[k] = foot->sign * (float)away[k];
             memcpy(contact->point, foot->best, sizeof contact->point);
             contact->status = foot->status;
             continue;
@@ -10492,7 +10504,9 @@ static int disti_cone_advance(const disti_tracer *tracer, disti_cone *cone, floa
 {
     cone->f = f;
     if (!disti_finite(f) || ++cone->steps > 64) return DISTI_CONE_BLOCKED;
-    if (f < cone->least_f) {
+    /* on the plateau of a clamped field, where samples are equal, the one nearest to the center */
+    int level = !(f > cone->least_f) && fabs(cone->t - cone->base) < fabs(cone->least_t - cone->base);
+    if (f < cone->least_f || level) {
         cone->least_f = f;
         cone->least_t = cone->t;
     }
@@ -10632,9 +10646,10 @@ static int disti_cones(const disti_tracer *tracer, int worker, const disti_tile 
     return blocked;
 }
 
-/* Prediction between neighbors: every 8th pixel (of large pixels every 4th: disti_render_lattice) is marched, then the pixels half way between known ones, three times over. 1 / z is linear over a plane, so the distance is
-   interpolated in it, from four collinear hits (-1, 9, 9, -1) / 16 where they are near each other, else from two; most
-   pixels then need one query. Two checks keep what is in front from being missed: no prediction across a miss or a jump
+/* Prediction between neighbors: every 8th pixel (of large pixels every 4th: disti_render_lattice) is marched, then the
+   pixels half way between known ones, three times over. 1 / z is linear over a plane, so the distance is interpolated
+   in it, from four collinear hits (-1, 9, 9, -1) / 16 where they are near each other, else from two; most pixels then
+   need one query. Two checks keep what is in front from being missed: no prediction across a miss or a jump
    in depth; and f where the cones stopped must not be smaller than the predicted surface alone would make it, or
    something else is near. */
 enum { DISTI_LATTICE = 8 };

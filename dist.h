@@ -155,7 +155,8 @@ typedef struct dist_context_desc {
 } dist_context_desc;
 
 /* desc may be NULL. Returns NULL only if memory cannot be had or half of an allocator is given; any other failure (a
-   refused hook) comes back as a context whose status says so and with which every further call fails with that status. */
+   refused hook) comes back as a context whose status says so and with which every further call fails with that
+   status. */
 DIST_API dist_context *dist_context_create(const dist_context_desc *desc);
 DIST_API void dist_context_destroy(dist_context *ctx);
 
@@ -641,8 +642,8 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
 #ifndef DIST_NO_BACKWARD
 /* Adjoint of the dist_render that filled the tape: reads d_out's depth, distance, normal, color, and silhouette if that
    was rendered; adds to grads; with how.relax_band color also at misses: outlines move, though not those that lie
-   before another surface. What is not finite in d_out counts as 0. d_out->stats, if given, gets capped, backward_points and skipped added. No
-   allocator call. */
+   before another surface. What is not finite in d_out counts as 0. d_out->stats, if given, gets capped,
+   backward_points and skipped added. No allocator call. */
 DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *tape, const dist_images *d_out,
                                           const dist_gradients *grads);
 #endif
@@ -8612,8 +8613,8 @@ static dist_status disti_camera_check(dist_context *ctx, const dist_camera *came
                           function, camera->width, camera->height);
     if (!disti_finite(camera->fx) || !disti_finite(camera->fy) || !(fabsf(camera->fx) > 1e-22f) ||
         !(fabsf(camera->fy) > 1e-22f)) /* their squares are to be above 0 */
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: camera.fx is %d, fy %d; must be finite and not 0 (1e-22 at "
-                                                  "least)",
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: camera.fx is %d, fy %d; must be finite and not 0 "
+                                                  "(1e-22 at least)",
                           function, (double)camera->fx, (double)camera->fy);
     const float other[4] = {camera->cx, camera->cy, camera->skew, camera->pixel_center};
     static const char *const named[4] = {"%s: camera.cx is %d, must be finite", "%s: camera.cy is %d, must be finite",

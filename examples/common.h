@@ -414,6 +414,8 @@ static inline void close_file(FILE *file, const char *path)
 static inline void check_stem(const char *stem)
 {
     char path[PATH_SIZE];
+    size_t length = strlen(stem);
+    if (length == 0 || stem[length - 1] == '/') { fail("--out \"%s\" is a folder: name the files, too", stem); }
     make_folders(stem);
     FILE *file = open_file(path_of(path, stem, ".json"), "ab");
     int empty = fseek(file, 0, SEEK_END) == 0 && ftell(file) == 0;
@@ -537,8 +539,18 @@ static inline void json_text(json *j, const char *key, const char *text)
             fprintf(j->file, "\\%c", c);
         } else if (c < 32) {
             fprintf(j->file, "\\u%04x", c);
-        } else {
+        } else if (c < 128) {
             fputc(c, j->file);
+        } else { /* as it stands if it is UTF-8, else as Latin 1 */
+            int more = c >= 0xf0 && c < 0xf5 ? 3 : c >= 0xe0 && c < 0xf0 ? 2 : c >= 0xc2 && c < 0xe0 ? 1 : 0;
+            int good = more > 0;
+            for (int i = 1; i <= more && good; i++) { good = ((unsigned char)at[i] & 0xc0) == 0x80; }
+            if (!good) {
+                fprintf(j->file, "\\u%04x", c);
+                continue;
+            }
+            fwrite(at, 1, (size_t)more + 1, j->file);
+            at += more;
         }
     }
     fputc('"', j->file);
@@ -568,6 +580,7 @@ static inline void add_stats(dist_stats *sum, const dist_stats *s)
     sum->operations_done += s->operations_done;
     sum->epsilon = sum->epsilon > 0.0f && sum->epsilon < s->epsilon ? sum->epsilon : s->epsilon;
     sum->lipschitz = sum->lipschitz > s->lipschitz ? sum->lipschitz : s->lipschitz;
+    sum->steepest = sum->steepest > s->steepest ? sum->steepest : s->steepest;
     sum->error = sum->error > s->error ? sum->error : s->error;
 }
 
@@ -595,6 +608,7 @@ static inline void json_stats(json *j, const char *key, const dist_stats *s)
     json_number(j, "operations_done", s->operations_done);
     json_number(j, "epsilon", (double)s->epsilon);
     json_number(j, "lipschitz", (double)s->lipschitz);
+    json_number(j, "steepest", (double)s->steepest);
     json_number(j, "error", (double)s->error);
     json_end(j);
 }
@@ -621,6 +635,7 @@ static inline dist_net *load_embedded(dist_context *ctx)
 #else
     (void)ctx;
     fail("this program was compiled without examples/model.h, so it has no embedded model");
+    return NULL;
 #endif
 }
 
@@ -731,6 +746,10 @@ static inline float *choose_code(const dist_net *net, const char *text)
         if (index >= count) { fail("code %s asked for; the model stores %d, counted from 0", text, count); }
         memcpy(code, dist_net_code(net, (int)index), (size_t)n * sizeof *code);
         return code;
+    }
+    if (text[strspn(text, "+-.0123456789")] == 0) {
+        if (count == 0) { fail("\"%s\" is no file, and the model stores no codes", text); }
+        fail("\"%s\" is neither one of the model's codes, 0 to %d, nor a file", text, count - 1);
     }
     read_code(text, (size_t)n, code);
     return code;
@@ -1119,14 +1138,24 @@ static inline canvas picture_sheet(int count, const canvas *pictures, const char
     return sheet;
 }
 
+#ifdef COMMON_STB
+/* stb_image_write's own file functions do not tell when a disk is full; close_file does. */
+static inline void write_bytes(void *file, void *bytes, int size)
+{
+    fwrite(bytes, 1, (size_t)size, (FILE *)file);
+}
+#endif
+
 /* Writes STEM.png, or STEM.ppm in a build without stb_image_write.h. Returns the name, good until the next call. */
 static inline const char *write_picture(const char *stem, int width, int height, const unsigned char *rgb)
 {
     static char path[PATH_SIZE];
 #ifdef COMMON_STB
-    if (!stbi_write_png(path_of(path, stem, ".png"), width, height, 3, rgb, 3 * width)) {
-        fail("%s cannot be written", path);
+    FILE *file = open_file(path_of(path, stem, ".png"), "wb");
+    if (!stbi_write_png_to_func(write_bytes, file, width, height, 3, rgb, 3 * width)) {
+        fail("out of memory while %s is written", path);
     }
+    close_file(file, path);
 #else
     static int told = 0;
     FILE *file = open_file(path_of(path, stem, ".ppm"), "wb");

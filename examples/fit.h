@@ -237,7 +237,7 @@ static inline void observation_keep(observation *s, double percent, int points, 
     for (size_t i = 0; i < s->n; i++) {
         if (s->mask[i] && is_depth(s->depth[i])) { pixels[count++] = i; }
     }
-    if (count == 0) { fail("the observation has no pixel with depth, so there is nothing to fit"); }
+    if (count == 0) { fail("the observation has no pixel with depth in its mask, so there is nothing to fit"); }
     size_t wanted = points ? (size_t)points : (size_t)((double)count * percent / 100.0 + 0.5);
     s->hits = count;
     s->seen_count = wanted < 1 ? 1 : wanted > count ? count : wanted;

@@ -65,7 +65,7 @@ int main(int argc, char **argv)
     check(ctx);
     printf("%s: %.0f vertices, %.0f triangles, %.2f seconds\n", path, (double)mesh->vertex_count,
            (double)mesh->triangle_count, seconds);
-    if (mesh->triangle_count == 0) { puts("the surface is empty: f is nowhere equal to the level"); }
+    if (mesh->triangle_count == 0) { puts("no cell meets the surface: there is none, or it is finer than the cells"); }
 
     dist_mesh_destroy(mesh);
     dist_shape_destroy(shape);

@@ -9431,11 +9431,13 @@ static int disti_ray_predicted(const disti_tracer *tracer, disti_ray *ray, float
     float slope = first || ray->own ? ray->incline : (f - ray->fa) / (ray->q - ray->a);
     float step = -f / slope, length = step < 0.0f ? -step : step;
     float magnitude = f < 0.0f ? -f : f, before = ray->fa < 0.0f ? -ray->fa : ray->fa;
+    int far = 2.0f * (float)(ray->base + (double)ray->q) * ray->footprint > 0.01f * tracer->field->radius;
     if (first && fronted && f > 0.0f) before = 0.5f * ray->f; /* the front's: it fell, or it ends elsewhere */
     int good = slope < -0.12f * tracer->lipschitz && length < 0.03f * tracer->field->radius && magnitude < before &&
                ray->side < 5;
     int ends = f < epsilon || slope < -0.3f * tracer->lipschitz; /* else f may flatten out before it is 0 */
-    if (good && ends && (!foreign || ray->width > 0.0f) && length <= (foreign ? ray->width : 12.0f) * epsilon) {
+    float most = foreign ? ray->width : far ? 1.0f : 12.0f;
+    if (good && ends && (!foreign || ray->width > 0.0f) && length <= most * epsilon) {
         float off = ray->q + step - ray->target;
         ray->slope = slope;
         if (length > 0.125f * (float)(ray->base + (double)ray->q) * ray->footprint) ray->own = 0; /* of a pixel: 1/16 */
@@ -14132,7 +14134,7 @@ static int disti_extract_mark(disti_extract *x, size_t slab)
     const dist_field *field = x->field;
     const float *sdf = x->batch + 3 * DISTI_MESH_BATCH;
     double half = 0.5 * (double)x->block;
-    double slope = 1.1 * (double)disti_steepest(field); /* the figure is often an estimate */
+    double slope = 2.0 * (double)disti_steepest(field); /* the figure is often an estimate; too small, it leaves holes */
     double reach = slope * 1.7320508075688772 * half * 2.0 * (double)field->radius / (double)x->cells;
     size_t total = x->blocks * x->blocks;
     if (x->no_skip) {

@@ -14134,8 +14134,11 @@ static int disti_extract_mark(disti_extract *x, size_t slab)
     const dist_field *field = x->field;
     const float *sdf = x->batch + 3 * DISTI_MESH_BATCH;
     double half = 0.5 * (double)x->block;
-    double slope = 2.0 * (double)disti_steepest(field); /* the figure is often an estimate; too small, it leaves holes */
-    double reach = slope * 1.7320508075688772 * half * 2.0 * (double)field->radius / (double)x->cells;
+    double reach = (double)disti_steepest(field) * 1.7320508075688772 * half * 2.0 * (double)field->radius /
+                   (double)x->cells;
+    /* the figure is often an estimate, and too small a one leaves holes; but a plateau beyond it is left out */
+    double plateau = field->clamp > 0.0f ? 0.95 * ((double)field->clamp - fabs((double)x->level)) : 3e38;
+    reach = DISTI_MIN(2.0 * reach, DISTI_MAX(1.1 * reach, plateau));
     size_t total = x->blocks * x->blocks;
     if (x->no_skip) {
         memset(x->active, 1, total);
@@ -14343,13 +14346,13 @@ static int disti_extract_begin(disti_extract *x)
     return 1;
 }
 
-/* Blocks of 8 cells, smaller where a clamped field could never rule one out; if 2 are still too many, all cells. */
+/* Blocks of 4 cells, of 2 where a clamped field could never rule one out; if these are still too large, all cells. */
 static void disti_extract_blocks(disti_extract *x)
 {
     double slope = 2.0 * (double)disti_steepest(x->field);
     double diagonal = slope * 1.7320508075688772 * (double)x->field->radius / (double)x->cells; /* half of one cell's */
     double visible = (double)x->field->clamp - fabs((double)x->level);
-    x->block = 8;
+    x->block = 4;
     while (x->field->clamp > 0.0f && x->block > 2 && diagonal * (double)x->block > 0.5 * visible) x->block /= 2;
     if (x->field->clamp > 0.0f && diagonal * (double)x->block > visible) x->no_skip = 1;
     x->blocks = (x->cells + x->block - 1) / x->block;

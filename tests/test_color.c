@@ -775,6 +775,35 @@ TEST(a_texture_net_is_created_saved_and_trained)
     free(weights);
 }
 
+TEST(color_gradients_too_large_for_floats_spoil_no_weight)
+{
+    dist_context *ctx = test_context();
+    dist_net_desc desc;
+    float points[6] = {0.1f, 0.2f, 0.3f, -0.2f, 0.1f, 0.4f};
+    memset(&desc, 0, sizeof desc);
+    desc.layers = 2;
+    desc.width = 16;
+    desc.color = 1;
+    desc.output_linear = 1;
+    dist_net *net = dist_net_create(ctx, &desc);
+    REQUIRE(net != NULL);
+    dist_shape *shape = dist_shape_create(ctx, net, NULL);
+    dist_field field = dist_shape_field(shape);
+    size_t count = dist_net_weight_count(net);
+    float *weights = (float *)calloc(count, sizeof(float));
+    for (int channel = 0; channel < 3; channel++) {
+        float d_color[6] = {0, 0, 0, 0, 0, 0};
+        dist_gradients grads;
+        memset(&grads, 0, sizeof grads);
+        grads.weights = weights;
+        d_color[channel] = d_color[3 + channel] = 3e38f;
+        CHECK_STATUS(DIST_OK, dist_color_backward(ctx, &field, 2, points, d_color, NULL, &grads), ctx);
+        CHECK(disti_finite_all(count, weights));
+    }
+    dist_shape_destroy(shape), dist_net_destroy(net), dist_context_destroy(ctx);
+    free(weights);
+}
+
 TEST(spot_with_its_texture_has_the_reference_colors)
 {
     enum { N = 128 * 128 };
@@ -867,6 +896,7 @@ int main(int argc, char **argv)
     RUN(memory_refused_to_a_texture_leaves_the_shape_as_it_was);
     RUN(a_texture_that_does_not_fit_and_gradients_that_are_not_there_are_refused);
     RUN(a_texture_net_is_created_saved_and_trained);
+    RUN(color_gradients_too_large_for_floats_spoil_no_weight);
     RUN(spot_with_its_texture_has_the_reference_colors);
     return test_report();
 }

@@ -360,6 +360,10 @@ TEST(mesh_files_that_mean_harm_are_refused_with_a_sentence)
         "OFF\n99999999999999 1 0\n1 2 3\n",
         "OFF\n1 99999999999999 0\n1 2 3\n",
         "OFF\n1 1 0\n1 2 3\n1e300 0 0 0\n",
+        "OFF\n-3 -1 0\n",
+        "OFF\n2.5 0 0\n0 0 0\n0 0 0\n0 0 0\n",
+        "OFF\n3 1 0\n0 0 0\n0 0 0\n0 0 0\n-3 0 1 2\n",
+        "OFF\n3 1 0\n0 0 0\n0 0 0\n0 0 0\n2.5 0 1 2\n",
         "v 0 0\n",
         "v 0 0 x\n",
         "v inf 0 0\n",
@@ -384,6 +388,8 @@ TEST(mesh_files_that_mean_harm_are_refused_with_a_sentence)
             "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n3 0 0 1\n",
         PLY "element vertex 1\n" XYZ
             "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n4000000000 0 0 0\n",
+        PLY "element vertex 1\n" XYZ
+            "element face 1\nproperty list int int vertex_indices\nend_header\n0 0 0\n-3 0 0 0\n",
         PLY "element vertex 4000000000\n" XYZ "end_header\n0 0 0\n",
         PLY "element vertex 99999999999999999999\n" XYZ "end_header\n",
         "ply\nformat binary_big_endian 1.0\nelement vertex 0\n" XYZ "end_header\n",

@@ -262,6 +262,18 @@ TEST(adam_stays_finite_for_huge_and_tiny_gradients)
     }
 }
 
+TEST(numbers_at_the_end_of_the_range_stay_in_it)
+{
+    float x[1] = {-3e38f}, d[1] = {0}, g[1] = {1}, moments[2] = {0, 0};
+    dist_adam adam;
+    memset(&adam, 0, sizeof adam);
+    CHECK(test_finite((double)dist_loss_code(1, x, 1, d)) && test_finite((double)d[0]) && d[0] < 0);
+    adam.moments = moments;
+    adam.rate = 3e38f;
+    CHECK_EQUAL(0, dist_adam_step(&adam, 1, x, g));
+    CHECK(test_finite((double)x[0]) && x[0] < -3e38f);
+}
+
 TEST(adam_skips_and_counts_gradients_that_are_not_finite)
 {
     float x[3] = {1, 2, 3}, g[3] = {0, 0, 1}, moments[6] = {0.5f, 0.25f, 0, 0.5f, 0.25f, 0};
@@ -319,6 +331,7 @@ int main(int argc, char **argv)
     RUN(adam_with_zero_gradients_never_moves);
     RUN(adam_with_a_rate_that_is_not_finite_never_moves);
     RUN(adam_stays_finite_for_huge_and_tiny_gradients);
+    RUN(numbers_at_the_end_of_the_range_stay_in_it);
     RUN(adam_skips_and_counts_gradients_that_are_not_finite);
     RUN(adam_without_its_arrays_says_that_nothing_moved);
     RUN(adam_with_a_negative_rate_moves_nothing);

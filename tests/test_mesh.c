@@ -271,6 +271,21 @@ TEST(skipping_changes_no_bit_and_saves_most_queries)
     dist_context_destroy(ctx);
 }
 
+/* Where a net's sampled Lipschitz figure ruled out a block that the surface pokes into, triangles were missing. */
+TEST(a_net_is_closed_at_a_fine_resolution)
+{
+    dist_context *ctx = test_context();
+    dist_net *net = dist_net_load_file(ctx, "examples/model.safetensors");
+    dist_shape *shape = dist_shape_create(ctx, net, dist_net_code(net, 130));
+    dist_field field = dist_shape_field(shape);
+    dist_mesh_desc desc = mesh_desc(256);
+    dist_mesh *mesh = dist_mesh_extract(ctx, &field, &desc);
+    REQUIRE(mesh != NULL);
+    CHECK(mesh->triangle_count > 100000);
+    CHECK(mesh_closed(mesh));
+    dist_mesh_destroy(mesh), dist_shape_destroy(shape), dist_net_destroy(net), dist_context_destroy(ctx);
+}
+
 TEST(refined_vertices_lie_on_the_surface_and_normals_are_analytic)
 {
     dist_context *ctx = test_context();
@@ -565,6 +580,22 @@ TEST(a_mesh_of_ones_own_is_checked)
     CHECK(!dist_mesh_create(ctx, 3, vertices, (size_t)-1 / 2, triangles));
     CHECK_TEXT("3 vertices and", dist_context_message(ctx));
     dist_context_clear(ctx);
+    /* spoiled afterwards: told to the context that is asked, not to the one that made it */
+    dist_context *other = test_context();
+    mesh = dist_mesh_create(other, 3, vertices, 1, triangles);
+    REQUIRE(mesh);
+    mesh->triangles[2] = 9;
+    size_t size;
+    float point[3];
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_mesh_sample(ctx, mesh, 1, 1, point), ctx);
+    CHECK_TEXT("dist_mesh_sample: a triangle has vertex 9, must be below 3", dist_context_message(ctx));
+    dist_context_clear(ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_mesh_write(ctx, mesh, DIST_MESH_PLY, NULL, 0, &size), ctx);
+    CHECK_TEXT("dist_mesh_write: a triangle has vertex 9", dist_context_message(ctx));
+    dist_context_clear(ctx);
+    CHECK_STATUS(DIST_OK, dist_context_status(other), other);
+    dist_mesh_destroy(mesh);
+    dist_context_destroy(other);
     uint32_t bits = 0x7f800000u;
     memcpy(vertices + 4, &bits, sizeof bits);
     CHECK(!dist_mesh_create(ctx, 3, vertices, 1, triangles));
@@ -766,6 +797,7 @@ int main(int argc, char **argv)
     RUN(two_spheres_are_two_closed_pieces);
     RUN(random_noise_is_closed_in_all_256_cases);
     RUN(skipping_changes_no_bit_and_saves_most_queries);
+    RUN(a_net_is_closed_at_a_fine_resolution);
     RUN(refined_vertices_lie_on_the_surface_and_normals_are_analytic);
     RUN(an_empty_surface_is_a_mesh_of_nothing);
     RUN(bad_descs_and_fields_are_refused);

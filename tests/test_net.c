@@ -962,6 +962,7 @@ TEST(metadata_that_means_nothing_is_refused_with_a_sentence)
                                            {"dist.skip", "1;2"},
                                            {"dist.skip", "-1"},
                                            {"dist.skip", "x"},
+                                           {"dist.skip", "1e300"},
                                            {"dist.skip_order", "input"},
                                            {"dist.skip_scale", "0"},
                                            {"dist.skip_scale", "-1"},

@@ -351,6 +351,57 @@ TEST(silhouette_of_misses_is_the_smallest_f_on_92_of_100)
     check_silhouette(10, 8);
 }
 
+static void clamped_ball(void *user, int worker, size_t n, const float *p, float *sdf, float *gradient)
+{
+    (void)user, (void)worker;
+    for (size_t i = 0; i < n; i++, p += 3) {
+        float x = p[0] - 0.05f, y = p[1] - 0.02f, z = p[2] + 0.03f, r = sqrtf(x * x + y * y + z * z), f = r - 0.5f;
+        int flat = f > 0.1f || f < -0.1f;
+        sdf[i] = flat ? (f > 0 ? 0.1f : -0.1f) : f;
+        const float away[3] = {x / r, y / r, z / r};
+        for (size_t k = 0; gradient && k < 3; k++) gradient[3 * i + k] = flat ? 0.0f : away[k];
+    }
+}
+
+/* On the plateau no sample is less than another, so that none says where to look. */
+TEST(silhouette_of_a_clamped_field_is_seen_from_the_plateau)
+{
+    dist_context *ctx = shape_context();
+    float eye[3] = {1.4f, 1.0f, 2.0f}, at[3] = {0, 0, 0}, up[3] = {0, 1, 0};
+    dist_camera camera = dist_camera_look_at(128, 128, 0.75f, eye, at, up);
+    dist_field field;
+    float *plane = (float *)malloc(128 * 128 * sizeof(float));
+    unsigned char *mask = (unsigned char *)malloc(128 * 128);
+    int near = 0, off = 0;
+    memset(&field, 0, sizeof field);
+    field.eval_fn = clamped_ball;
+    field.radius = field.lipschitz = 1.0f;
+    field.clamp = 0.1f;
+    dist_images out;
+    memset(&out, 0, sizeof out);
+    out.silhouette = plane;
+    out.mask = mask;
+    CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, NULL), ctx);
+    for (int i = 0; i < 128 * 128; i++) {
+        float o[3], d[3];
+        double e[3], along = 0, square = 0;
+        dist_camera_ray(&camera, (float)(i % 128), (float)(i / 128), o, d);
+        for (int k = 0; k < 3; k++) {
+            e[k] = (double)o[k] - (k == 0 ? 0.05 : k == 1 ? 0.02 : -0.03);
+            along += e[k] * (double)d[k];
+            square += e[k] * e[k];
+        }
+        double least = sqrt(square - along * along) - 0.5;
+        if (mask[i] || least > 0.095) continue;
+        near++;
+        off += fabs((double)plane[i] - least) > (least < 0.05 ? 1e-3 : 1e-2);
+    }
+    CHECK(near > 1000);
+    CHECK_EQUAL(0, off);
+    free(plane), free(mask);
+    dist_context_destroy(ctx);
+}
+
 /* 36 */
 TEST(silhouette_off_the_sphere_is_the_distance_to_it)
 {
@@ -378,6 +429,51 @@ TEST(silhouette_off_the_sphere_is_the_distance_to_it)
         CHECK(outside > 1000);
     }
     dist_context_destroy(ctx);
+}
+
+/* Prediction also pays where pixels are a 50th to a 100th of the radius: smaller pictures never ask for more. */
+TEST(a_smaller_picture_asks_for_less)
+{
+    dist_context *ctx = shape_context();
+    dist_net *net = dist_net_load_file(ctx, "examples/model.safetensors");
+    float eye[3] = {1.14f, 0.93f, 1.63f}, at[3] = {0, 0, 0}, up[3] = {0, 1, 0};
+    static const int codes[3] = {5, 70, 200}, sizes[4] = {512, 288, 256, 160};
+    float *depth = (float *)malloc(512 * 512 * sizeof(float)), *exact = (float *)malloc(512 * 512 * sizeof(float));
+    for (int k = 0; k < 3; k++) {
+        dist_shape *shape = dist_shape_create(ctx, net, dist_net_code(net, codes[k]));
+        dist_field field = dist_shape_field(shape);
+        unsigned long long last = ~0ull;
+        for (int j = 0; j < 4; j++) {
+            dist_camera camera = dist_camera_look_at(sizes[j], sizes[j], 1.174f, eye, at, up);
+            dist_stats stats, alone;
+            dist_render_desc how = plain_how();
+            dist_images out;
+            int hits = 0, other = 0;
+            memset(&out, 0, sizeof out);
+            out.depth = depth, out.stats = &stats;
+            how.epsilon = 0.0f;
+            CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+            CHECK(stats.queries < last);
+            last = stats.queries;
+            if (j == 0) continue;
+            out.depth = exact, out.stats = &alone;
+            how.no_prediction = 1;
+            CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+            CHECK(10 * stats.queries < 6 * alone.queries);
+            for (int i = 0; i < sizes[j] * sizes[j]; i++) {
+                hits += exact[i] > 0.0f;
+                other += fabs((double)exact[i] - (double)depth[i]) > 5e-5;
+            }
+            CHECK(hits > 1000);
+            CHECK(100 * other < hits);
+            if (test_state.verbose)
+                printf("    %d pixels: %llu queries, alone %llu; %d of %d hits differ\n", sizes[j], stats.queries,
+                       alone.queries, other, hits);
+        }
+        dist_shape_destroy(shape);
+    }
+    dist_net_destroy(net), dist_context_destroy(ctx);
+    free(depth), free(exact);
 }
 
 /* 34: the outline moves over pixels, the value goes through 0 without a jump. */
@@ -1396,7 +1492,9 @@ int main(int argc, char **argv)
     RUN(a_surface_without_slope_has_normal_zero_or_unit_and_nothing_is_nan);
     RUN(silhouette_near_the_outline_is_the_smallest_f_on_98_of_100);
     RUN(silhouette_of_misses_is_the_smallest_f_on_92_of_100);
+    RUN(silhouette_of_a_clamped_field_is_seen_from_the_plateau);
     RUN(silhouette_off_the_sphere_is_the_distance_to_it);
+    RUN(a_smaller_picture_asks_for_less);
     RUN(silhouette_is_continuous_and_the_mask_changes_by_single_pixels);
     RUN(scale_of_the_world_changes_nothing);
     RUN(far_cameras_see_what_double_sees);

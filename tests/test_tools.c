@@ -150,6 +150,15 @@ TEST(any_hit_and_max_distance_are_refused_where_they_mean_nothing)
         CHECK_STATUS(i == 1 || i == 2 ? DIST_OK : DIST_BAD_ARGUMENT,
                      dist_trace(ctx, &field, 0, NULL, NULL, &how, NULL, NULL), ctx);
     }
+    dist_context_clear(ctx);
+    memset(&how, 0, sizeof how);
+    how.trace = DIST_TRACE_PAPER; /* and what is for pictures, by dist_trace */
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_trace(ctx, &field, 0, NULL, NULL, &how, NULL, NULL), ctx);
+    CHECK_TEXT("how.trace DIST_TRACE_PAPER is for pictures", dist_context_message(ctx));
+    dist_context_clear(ctx);
+    how.trace = 0, how.warm_start = 1;
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_trace(ctx, &field, 0, NULL, NULL, &how, NULL, NULL), ctx);
+    CHECK_TEXT("how.warm_start is for pictures", dist_context_message(ctx));
     dist_context_destroy(ctx);
 }
 
@@ -540,6 +549,55 @@ TEST(points_far_beyond_the_sphere_have_a_nearest_point)
     CHECK_EQUAL(DIST_RAY_HIT, contacts[1].status);
     CHECK_NEAR(1e20, contacts[1].depth, 1e14);
     CHECK_NEAR(1.0, contacts[1].normal[1], 1e-6);
+    float farther[4] = {3.4e38f, 0, 3.1f, 3.4e38f};
+    CHECK_STATUS(DIST_OK, dist_field_collide(ctx, &field, 1, farther, contacts), ctx);
+    CHECK_EQUAL(DIST_RAY_HIT, contacts[0].status);
+    CHECK_NEAR(1.0, contacts[0].normal[0], 1e-6);
+    dist_context_destroy(ctx);
+}
+
+/* f that would lead far away: nothing is asked beyond the sphere all the same. */
+static long beyond;
+static void huge_eval(void *user, int worker, size_t n, const float *p, float *sdf, float *gradient)
+{
+    (void)worker;
+    for (size_t i = 0; i < n; i++) {
+        double square = 0.0;
+        for (size_t k = 0; k < 3; k++) square += (double)p[3 * i + k] * (double)p[3 * i + k];
+        beyond += !(square < 1.00001);
+        sdf[i] = *(const float *)user;
+    }
+    if (gradient) memset(gradient, 0, 3 * n * sizeof(float));
+}
+
+TEST(no_f_leads_beyond_the_sphere)
+{
+    float values[4] = {3e38f, -3e38f, 1e9f, -1e9f}, spheres[8] = {0.3f, 0.2f, 0.1f, 0.5f, 0, 0, 0, 0.1f};
+    dist_context *ctx = test_context();
+    for (int k = 0; k < 4; k++) {
+        dist_field field;
+        memset(&field, 0, sizeof field);
+        field.user = &values[k];
+        field.eval_fn = huge_eval;
+        field.radius = 1.0f;
+        field.lipschitz = k < 2 ? 0.0f : 1e-30f;
+        beyond = 0;
+        CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &field, 2, spheres, closest, distance, status), ctx);
+        CHECK_STATUS(DIST_OK, dist_field_collide(ctx, &field, 2, spheres, contacts), ctx);
+        CHECK_EQUAL(0, beyond);
+        CHECK(disti_finite_all(6, closest) && disti_finite_all(2, distance));
+        for (int i = 0; i < 2; i++) CHECK(disti_finite_all(3, contacts[i].point) && disti_finite(contacts[i].depth));
+    }
+    dist_context_destroy(ctx);
+}
+
+TEST(fields_too_far_from_0_are_refused)
+{
+    dist_context *ctx = test_context();
+    float sphere[4] = {0, 2e15f, 0, 1}, p[3] = {0, 0, 0}, f;
+    dist_field field = dist_field_sphere(sphere);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_eval(ctx, &field, 1, p, &f, NULL), ctx);
+    CHECK_TEXT("dist_field_eval: field.center[1] is 2e15, must be within 1e15 of 0", dist_context_message(ctx));
     dist_context_destroy(ctx);
 }
 
@@ -582,6 +640,8 @@ int main(int argc, char **argv)
     RUN(what_has_no_answer_says_so);
     RUN(more_points_than_there_can_be_are_refused);
     RUN(points_far_beyond_the_sphere_have_a_nearest_point);
+    RUN(no_f_leads_beyond_the_sphere);
+    RUN(fields_too_far_from_0_are_refused);
     RUN(many_points_are_the_same_as_single_ones);
     return test_report();
 }

@@ -1682,10 +1682,12 @@ TEST(what_neighbors_were_off_counts_by_the_distance_they_were_predicted_from)
     disti_guess_off(&guess, &before, &behind, DISTI_LATTICE, 3, 0, 1); /* (2, 0) from 2, (4, 0) from 4 pixels away */
     CHECK_NEAR(2e-4, guess.off, 1e-9);
     CHECK_NEAR(8e-4, guess.seen, 1e-9);
-    disti_guess_off(&guess, &before, &behind, DISTI_LATTICE, 6, 0, 2); /* (4, 0); (8, 0) is of the lattice, whatever its ray says */
+    /* (4, 0); (8, 0) is of the lattice, whatever its ray says */
+    disti_guess_off(&guess, &before, &behind, DISTI_LATTICE, 6, 0, 2);
     CHECK_NEAR(1.5e-4, guess.off, 1e-9);
     CHECK_NEAR(3e-4, guess.seen, 1e-9);
-    disti_guess_off(&guess, &before, &behind, DISTI_LATTICE, 17, 24, 1); /* (16, 24) is of it, too; (18, 24) speaks for both */
+    /* (16, 24) is of it, too; (18, 24) speaks for both */
+    disti_guess_off(&guess, &before, &behind, DISTI_LATTICE, 17, 24, 1);
     CHECK_NEAR(4e-4, guess.off, 1e-9);
     disti_guess_off(&guess, &before, &behind, DISTI_LATTICE, 5, 7, 1); /* (4, 7) and (6, 7): from next to them */
     CHECK_NEAR(8e-4, guess.off, 1e-9);

@@ -5373,7 +5373,7 @@ static int disti_archive_header(disti_reader *r, size_t size)
     if (size < 10) return disti_bad(r, "has %d bytes, a safetensors file has at least 10", NULL, (double)size, 0);
     size_t most = DISTI_MIN(size - 8, (size_t)DISTI_HEADER_MAX);
     if (length < 2 || length > most)
-        return disti_bad(r, "has a header length of %d, must be 2 to %d", NULL, (double)length, (double)most);
+        return disti_bad(r, "has a header length of %d, must be 2 to %d: no safetensors", NULL, (double)length, (double)most);
     r->header = r->bytes + 8;
     r->end = r->header + (size_t)length;
     r->data_size = size - 8 - (size_t)length;
@@ -10159,8 +10159,8 @@ static float disti_foot_length(const float d[3])
 /* Moves x by `step` times n and keeps it in the bounding sphere. Returns how far out it would have been. */
 static float disti_foot_move(const dist_field *field, float *x, const float *n, float step)
 {
-    const float *c = field->center, most = 4.0f * field->radius; /* beyond that nothing is new: it comes back */
-    for (int i = 0; i < 3; i++) x[i] += DISTI_MIN(DISTI_MAX(step * n[i], -most), most);
+    const float *c = field->center;
+    for (int i = 0; i < 3; i++) x[i] += step * n[i];
     float d[3] = {x[0] - c[0], x[1] - c[1], x[2] - c[2]}, length = disti_foot_length(d);
     for (int i = 0; i < 3 && length > field->radius; i++) x[i] = c[i] + (x[i] - c[i]) / length * field->radius;
     return DISTI_MAX(length - field->radius, 0.0f);
@@ -10232,7 +10232,9 @@ static int disti_foot_advance(const dist_field *field, disti_foot *foot, float f
     }
     if (f * foot->f < 0.0f && size > 0.5f * (foot->f < 0.0f ? -foot->f : foot->f)) foot->damping *= 0.5f;
     foot->f = f;
-    disti_foot_move(field, foot->x, n, -foot->damping * f / DISTI_MAX(slope, 0.5f * lipschitz));
+    double step = (double)foot->damping * (double)f / (double)DISTI_MAX(slope, 0.5f * lipschitz);
+    double most = 4.0 * (double)field->radius; /* it comes back to the sphere from any farther, too */
+    disti_foot_move(field, foot->x, n, (float)-DISTI_MIN(DISTI_MAX(step, -most), most));
     return 1;
 }
 
@@ -12698,7 +12700,7 @@ static void disti_tile_init(const disti_render_job *job, int index, disti_tile *
     tile->y = index / job->across * job->tile;
     tile->own_width = tile->width = DISTI_MIN(job->tile, job->view->width - tile->x);
     tile->own_height = tile->height = DISTI_MIN(job->tile, job->view->height - tile->y);
-    tile->lattice = job->lattice;
+    tile->lattice = job->lattice ? job->lattice : (int)DISTI_LATTICE; /* a warm start predicts all the same */
     tile->lazy = job->lazy;
     tile->cheap = job->cheap;
 }

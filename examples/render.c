@@ -150,6 +150,7 @@ static job read_options(int argc, char **argv)
     }
     if (j.lit && j.lighting.count == 0) { j.lighting.count = 2; }
     if (j.color_code && !j.texture) { fail("--color-code is of a texture: --texture names it"); }
+    if (j.zoom_at_given && !j.zoom) { fail("--zoom-at is of --zoom, which is not given"); }
     if (j.relit && j.frames) { fail("--relight is of one picture, and --turntable asks for %d", j.frames); }
     if (j.report && j.frames) { fail("--report is of one picture, and --turntable asks for %d", j.frames); }
     if (j.zoom > j.view.width || j.zoom > j.view.height) { fail("--zoom %d leaves no pixel of the picture", j.zoom); }

@@ -5373,7 +5373,8 @@ static int disti_archive_header(disti_reader *r, size_t size)
     if (size < 10) return disti_bad(r, "has %d bytes, a safetensors file has at least 10", NULL, (double)size, 0);
     size_t most = DISTI_MIN(size - 8, (size_t)DISTI_HEADER_MAX);
     if (length < 2 || length > most)
-        return disti_bad(r, "has a header length of %d, must be 2 to %d: no safetensors", NULL, (double)length, (double)most);
+        return disti_bad(r, "has a header length of %d, must be 2 to %d: no safetensors", NULL, (double)length,
+                         (double)most);
     r->header = r->bytes + 8;
     r->end = r->header + (size_t)length;
     r->data_size = size - 8 - (size_t)length;

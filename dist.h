@@ -3678,7 +3678,7 @@ static dist_status disti_field_check(dist_context *ctx, const dist_field *field,
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.radius is %d, must be 1e-15 to 1e15", function,
                           (double)field->radius, 0);
     for (int i = 0; i < 3; i++)
-        if (!(fabsf(field->center[i]) <= DISTI_RADIUS_MOST))
+        if (!disti_finite(field->center[i]) || fabsf(field->center[i]) > DISTI_RADIUS_MOST)
             return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.center[%d] is %d, must be within 1e15 of 0", function,
                               i, (double)field->center[i]);
     const disti_limit limits[] = {

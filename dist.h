@@ -8618,9 +8618,9 @@ static dist_status disti_camera_check(dist_context *ctx, const dist_camera *came
                                                   "(1e-22 at least)",
                           function, (double)camera->fx, (double)camera->fy);
     const float other[4] = {camera->cx, camera->cy, camera->skew, camera->pixel_center};
-    static const char *const named[4] = {"%s: camera.cx is %d, must be finite", "%s: camera.cy is %d, must be finite",
-                                         "%s: camera.skew is %d, must be finite",
-                                         "%s: camera.pixel_center is %d, must be finite"};
+    static const char named[4][46] = {"%s: camera.cx is %d, must be finite", "%s: camera.cy is %d, must be finite",
+                                      "%s: camera.skew is %d, must be finite",
+                                      "%s: camera.pixel_center is %d, must be finite"};
     for (int i = 0; i < 4; i++)
         if (!disti_finite(other[i]))
             return disti_fail(ctx, DIST_NOT_FINITE, named[i], function, (double)other[i], 0);

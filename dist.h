@@ -8805,7 +8805,7 @@ typedef struct disti_ray {
 enum {
     DISTI_DONE,
     DISTI_WAIT,    /* its turn has not come */
-    DISTI_FIRST,   /* the start of the march */
+    DISTI_FIRST,   /* the start of the march; b, fb > 0: a second query, before b */
     DISTI_MARCH,   /* a sphere step */
     DISTI_SKIP,    /* past what other rays' samples prove empty */
     DISTI_JUMP,    /* to where f should end */
@@ -9220,7 +9220,8 @@ static int disti_ray_step(const disti_tracer *tracer, disti_ray *ray)
         jump = disti_ray_jump(tracer, ray, told ? -ray->incline : -ray->slope, radius);
     int mode = jump > 0.0f ? DISTI_JUMP : DISTI_MARCH;
     if (jump > 0.0f) step = jump;
-    if (ray->known && slope > -0.3f) { /* but not through a surface that the slope foretells */
+    int local = ray->fa > 0.0f; /* the slope; one over what was skipped says nothing of a pixel */
+    if (ray->known && local && slope > -0.3f) { /* but not through a surface that the slope foretells */
         float floor = disti_ray_floor(tracer, ray);
         if (slope < 0.0f) floor = DISTI_MIN(floor, 0.9f * ray->f / -ray->slope);
         step = DISTI_MAX(step, floor);
@@ -9493,6 +9494,19 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
         ray->f = f;
         ray->slope = ray->fa = 0.0f;
         ray->known = 0;
+        if (ray->fb > 0.0f) { /* the second query */
+            ray->a = q;
+            ray->fa = f;
+            ray->s = ray->b;
+            ray->f = ray->fb;
+            ray->slope = (ray->f - f) / (ray->b - q);
+            ray->known = 1;
+            ray->fb = 0.0f;
+        } else if (f < disti_ray_near(tracer, ray, q) && q > ray->enter && !(ray->fb < 0.0f)) {
+            ray->b = q; /* cones or other rays' spheres led up to this: does f fall toward it? One looks from before */
+            ray->fb = f;
+            return disti_ray_ask(ray, DISTI_FIRST, DISTI_MAX(q - 4.0f * disti_ray_near(tracer, ray, q), ray->enter));
+        }
         break;
     case DISTI_BACK:
         if (f >= 0.0f) return disti_ray_open_bracket(tracer, ray, q, f, ray->b, ray->fb);
@@ -9850,6 +9864,7 @@ static int disti_skip(const disti_bench *bench, int index, disti_ray *ray)
 {
     if (ray->mode != DISTI_FIRST && ray->mode != DISTI_MARCH && ray->mode != DISTI_SKIP) return 1;
     int begins = ray->mode == DISTI_FIRST;
+    if (begins && ray->fb > 0.0f) return 1; /* it has been there */
     float s = disti_covered(bench, index, ray, begins ? ray->q : ray->s);
     if (s >= ray->leave) return disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest * ray->sign, 0.0f);
     if (s <= ray->q) return 1;

@@ -137,6 +137,12 @@ static int side(void)
     return test_quick() ? 48 : SIDE;
 }
 
+/* Pixels of large pictures, and a quarter of them in slow surroundings. */
+static int bound_side(void)
+{
+    return test_quick() ? SIDE : WIDE;
+}
+
 /* A spent budget is reported, and rare: rays that graze a field of half the slope. */
 TEST(every_crossing_is_hit_and_999_of_1000_within_the_error_bound)
 {
@@ -180,6 +186,38 @@ TEST(no_plate_however_thin_is_missed)
                     "    %g thick: crossing %d, missed %d, phantom %d, outline %d, judged %d, broken %d, worst %.1e\n",
                     thin[k], v.crossing, v.missed, v.phantom, v.outline, v.judged, v.broken, v.worst);
         }
+    }
+    dist_context_destroy(ctx);
+}
+
+/* 17, where pixels are so small that most hits are predicted, and spheres that other rays know to be empty lead up to
+   the plate. */
+TEST(no_thin_plate_is_missed_by_large_pictures)
+{
+    dist_context *ctx = shape_context();
+    const double thin[3] = {1e-3, 3e-5, 1e-5};
+    const float at[3] = {0, 0, 0}, up[3] = {0, 1, 0};
+    int size = bound_side();
+    for (int k = 0; k < 3 * 2 * 3 * 2; k++) {
+        int flat = k / 3 % 2, view = k / 6 % 3;
+        double d = thin[k % 3];
+        test_shape shape = shape_make(SHAPE_BOX, flat ? 0.6 : 0.5 * d, 0.5, flat ? 0.5 * d : 0.6, 0);
+        dist_field field = shape_field(&shape, 1, 1);
+        float turn = 0.6f + 1.3f * (float)view, rise = 0.3f - 0.25f * (float)view;
+        float eye[3] = {2.2f * cosf(rise) * sinf(turn), 2.2f * sinf(rise), 2.2f * cosf(rise) * cosf(turn)};
+        dist_camera camera = dist_camera_look_at(size, size, size < WIDE ? 0.5f : 0.95f, eye, at, up);
+        dist_render_desc how = plain_how();
+        how.certified = k >= 18;
+        CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, &how, &picture_a), ctx);
+        CHECK(picture_a.stats.queries < 3 * picture_a.stats.hits + 20000 || how.certified);
+        verdict v = judge(&shape, &camera, 1, 1, fmin(1e-5, 0.1 * d), &picture_a);
+        int good = CHECK_EQUAL(0, v.missed) & CHECK_EQUAL(0, v.spent) & CHECK_EQUAL(0, v.phantom) &
+                   CHECK(v.broken * 1000 <= v.judged) & CHECK(v.crossing > 0);
+        if (!good || test_state.verbose)
+            printf("    %g thick, flat %d, view %d, certified %d: crossing %d, missed %d, phantom %d, outline %d, "
+                   "judged %d, broken %d, worst %.1e, queries %llu\n",
+                   d, flat, view, how.certified, v.crossing, v.missed, v.phantom, v.outline, v.judged, v.broken,
+                   v.worst, picture_a.stats.queries);
     }
     dist_context_destroy(ctx);
 }
@@ -241,6 +279,39 @@ TEST(no_rod_thinner_than_a_pixel_is_missed)
 }
 
 /* how.certified takes no step on trust: what the bounds on slopes allow is all found, none missed. */
+/* Where pixels are smaller most hits are predicted, and rays skip what others know to be empty; where they come from
+   that they must not creep along by more than the rod is thick. */
+TEST(one_pixel_in_5000_of_a_rod_is_missed_by_large_pictures_and_none_certified)
+{
+    dist_context *ctx = shape_context();
+    const float up[3] = {0, 1, 0}, at[3] = {0, 0, 0};
+    test_shape shape = shape_make(SHAPE_RODS, 1e-3, 0, 0, 0);
+    dist_field field = shape_field(&shape, 1, 1);
+    test_random r = test_random_seed(17);
+    int crossing = 0, missed[2] = {0, 0};
+    for (int k = 0; k < (test_quick() ? 4 : 8); k++) {
+        float eye[3];
+        test_random_direction(&r, eye);
+        for (int i = 0; i < 3; i++) eye[i] *= 2.4f;
+        dist_camera camera = dist_camera_look_at(bound_side(), bound_side(), test_quick() ? 0.25f : 0.5f, eye, at, up);
+        for (int certified = 0; certified < 2; certified++) {
+            dist_render_desc how = plain_how();
+            how.certified = certified;
+            CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, &how, &picture_a), ctx);
+            verdict v = judge(&shape, &camera, 1, 1, 1e-5, &picture_a);
+            CHECK(v.spent == 0 && v.phantom == 0);
+            crossing += certified ? 0 : v.crossing;
+            missed[certified] += v.missed;
+        }
+    }
+    if (test_state.verbose)
+        printf("    of %d pixels of rods %d are missed, certified %d\n", crossing, missed[0], missed[1]);
+    CHECK(crossing > 500);
+    CHECK(missed[0] * 5000 <= crossing);
+    CHECK_EQUAL(0, missed[1]);
+    dist_context_destroy(ctx);
+}
+
 TEST(certified_rays_miss_nothing)
 {
     dist_context *ctx = shape_context();
@@ -1314,12 +1385,6 @@ TEST(the_paper_converges_up_to_slope_1_2_and_not_from_1_34_on)
 
 /* ---- error bounds ------------------------------------------------------------------------------------------------ */
 
-/* Pixels of these pictures, and a quarter of them in slow surroundings. */
-static int bound_side(void)
-{
-    return test_quick() ? SIDE : WIDE;
-}
-
 /* picture_a is traced and compared with picture_b, the truth: of the hits that are also the truth's, 999 of 1000 at
    least must be off by no more than their error and the truth's together. Hits where the truth has none are false, and
    at most 1 in 1000, like those of which the truth is not known. With a `how` of its own: 2 in 1000. Of fewer than 1000
@@ -1902,8 +1967,10 @@ int main(int argc, char **argv)
     test_begin(argc, argv);
     RUN(every_crossing_is_hit_and_999_of_1000_within_the_error_bound);
     RUN(no_plate_however_thin_is_missed);
+    RUN(no_thin_plate_is_missed_by_large_pictures);
     RUN(no_plate_is_missed_silently_at_any_angle);
     RUN(no_rod_thinner_than_a_pixel_is_missed);
+    RUN(one_pixel_in_5000_of_a_rod_is_missed_by_large_pictures_and_none_certified);
     RUN(certified_rays_miss_nothing);
     RUN(no_sheet_before_a_solid_is_passed);
     RUN(no_wire_before_a_surface_is_passed_by_certified_pictures);

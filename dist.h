@@ -9433,11 +9433,13 @@ static int disti_ray_predicted(const disti_tracer *tracer, disti_ray *ray, float
     float slope = first || ray->own ? ray->incline : (f - ray->fa) / (ray->q - ray->a);
     float step = -f / slope, length = step < 0.0f ? -step : step;
     float magnitude = f < 0.0f ? -f : f, before = ray->fa < 0.0f ? -ray->fa : ray->fa;
+    int far = 2.0f * (float)(ray->base + (double)ray->q) * ray->footprint > 0.01f * tracer->field->radius;
     if (first && fronted && f > 0.0f) before = 0.5f * ray->f; /* the front's: it fell, or it ends elsewhere */
     int good = slope < -0.12f * tracer->lipschitz && length < 0.03f * tracer->field->radius && magnitude < before &&
                ray->side < 5;
     int ends = f < epsilon || slope < -0.3f * tracer->lipschitz; /* else f may flatten out before it is 0 */
-    if (good && ends && (!foreign || ray->width > 0.0f) && length <= (foreign ? ray->width : 12.0f) * epsilon) {
+    float most = foreign ? ray->width : far ? 1.0f : 12.0f;
+    if (good && ends && (!foreign || ray->width > 0.0f) && length <= most * epsilon) {
         float off = ray->q + step - ray->target;
         ray->slope = slope;
         if (length > 0.125f * (float)(ray->base + (double)ray->q) * ray->footprint) ray->own = 0; /* of a pixel: 1/16 */
@@ -10372,6 +10374,7 @@ typedef struct disti_tile {
     const size_t *list; /* pixels of the rays, which then stand in one row; NULL: a rectangle */
     int x, y, width, height; /* traced: at most DISTI_TILE + 1 each */
     int own_width, own_height; /* written */
+    int lattice; /* pixels between those that are marched before the others are predicted */
     int cheap, normals; /* 1: queries cost less than bookkeeping; grad f is wanted at hits */
     int lazy; /* 1: only the rays that the cones leave are made; of the others no more is known than that they miss */
 } disti_tile;
@@ -10664,11 +10667,12 @@ static int disti_cones(const disti_tracer *tracer, int worker, const disti_tile 
     return blocked;
 }
 
-/* Prediction between neighbors: every 8th pixel is marched, then the pixels half way between known ones, three times
-   over. 1 / z is linear over a plane, so the distance is interpolated in it, from four collinear hits (-1, 9, 9, -1)
-   / 16 where they are near each other, else from two; most pixels then need one query. Two checks keep what is in
-   front from being missed: no prediction across a miss or a jump in depth; and f where the cones stopped must not be
-   smaller than the predicted surface alone would make it, or something else is near. */
+/* Prediction between neighbors: every 8th pixel (of large pixels every 4th: disti_render_lattice) is marched, then the
+   pixels half way between known ones, three times over. 1 / z is linear over a plane, so the distance is interpolated
+   in it, from four collinear hits (-1, 9, 9, -1) / 16 where they are near each other, else from two; most pixels then
+   need one query. Two checks keep what is in front from being missed: no prediction across a miss or a jump
+   in depth; and f where the cones stopped must not be smaller than the predicted surface alone would make it, or
+   something else is near. */
 enum { DISTI_LATTICE = 8 };
 
 /* Depth of the hit `shift` pixels along one axis; 0 where there is none. */
@@ -10691,10 +10695,10 @@ typedef struct disti_guess {
    pixels farther apart, at its `level`, the lowest bit of its coordinates: on a smooth surface the error grows with the
    fourth power of that distance, at a crease amid the four with the distance itself, so theirs counts h / level times.
    For pixels of the lattice, which were not predicted, the other neighbor speaks. */
-static void disti_guess_off(disti_guess *guess, const disti_ray *before, const disti_ray *behind, int at, int beside,
-                            int h)
+static void disti_guess_off(disti_guess *guess, const disti_ray *before, const disti_ray *behind, int lattice, int at,
+                            int beside, int h)
 {
-    int level1 = ((at - h) | beside) % DISTI_LATTICE, level2 = ((at + h) | beside) % DISTI_LATTICE;
+    int level1 = ((at - h) | beside) % lattice, level2 = ((at + h) | beside) % lattice;
     float off1 = before->off, off2 = behind->off;
     if (before->kept || behind->kept) { /* warm: predicted by the last picture, or from next to it */
         level1 = level2 = h;
@@ -10709,8 +10713,8 @@ static void disti_guess_off(disti_guess *guess, const disti_ray *before, const d
 
 /* Prediction along one axis of the picture from the hits at -3 h, -h, h, 3 h. Across an edge, where the hits at -h and
    h are a step apart, it is the farther surface, in case that the ray passes the nearer. */
-static disti_guess disti_predict_axis(const disti_tracer *tracer, const disti_ray *ray, const float *depth, int at,
-                                      int beside, int end, int h, int stride)
+static disti_guess disti_predict_axis(const disti_tracer *tracer, const disti_ray *ray, const float *depth, int lattice,
+                                      int at, int beside, int end, int h, int stride)
 {
     disti_guess guess;
     memset(&guess, 0, sizeof guess);
@@ -10742,7 +10746,7 @@ static disti_guess disti_predict_axis(const disti_tracer *tracer, const disti_ra
         float line = 1.0f / inverse;
         inverse = (9.0f / z1 + 9.0f / z2 - 1.0f / a - 1.0f / b) * 0.0625f;
         guess.sag = line * inverse < 1.0f ? 1.0f / inverse - line : line - 1.0f / inverse;
-        disti_guess_off(&guess, &ray[-h * stride], &ray[h * stride], at, beside, h);
+        disti_guess_off(&guess, &ray[-h * stride], &ray[h * stride], lattice, at, beside, h);
         guess.quality += guess.quality == 2;
     }
     guess.depth = 1.0f / inverse;
@@ -10759,10 +10763,10 @@ static int disti_predict(const disti_tracer *tracer, const disti_tile *tile, con
     float *depth = &bench->depth[y * tile->width + x];
     int odd_x = x & h, odd_y = y & h;
     disti_guess guess, other;
-    guess = disti_predict_axis(tracer, ray, depth, odd_x ? x : y, odd_x ? y : x, odd_x ? tile->width : tile->height, h,
-                               odd_x ? 1 : tile->width);
+    guess = disti_predict_axis(tracer, ray, depth, tile->lattice, odd_x ? x : y, odd_x ? y : x,
+                               odd_x ? tile->width : tile->height, h, odd_x ? 1 : tile->width);
     if (odd_x && odd_y) {
-        other = disti_predict_axis(tracer, ray, depth, y, x, tile->height, h, tile->width);
+        other = disti_predict_axis(tracer, ray, depth, tile->lattice, y, x, tile->height, h, tile->width);
         if (guess.quality > 0 && other.quality > 0) {
             guess.differ = guess.depth < other.depth ? other.depth - guess.depth : guess.depth - other.depth;
             guess.depth = 0.5f * (guess.depth + other.depth);
@@ -10790,12 +10794,13 @@ static int disti_predict(const disti_tracer *tracer, const disti_tile *tile, con
     ray->aim = (unsigned char)(guess.quality >= 2 ? 1 : 2);
     ray->target = s;
     ray->incline = guess.slope;
-    if (guess.quality >= 2 && guess.slope < -0.3f * tracer->lipschitz) /* else 0: a second query makes sure */
+    int near = tile->lattice == DISTI_LATTICE; /* neighbors far from each other say where, but not how steeply */
+    if (near && guess.quality >= 2 && guess.slope < -0.3f * tracer->lipschitz) /* else 0: a second query makes sure */
         ray->width = DISTI_MAX(4.0f, 0.35f / (0.03f + 0.5f * guess.spread));
     ray->s = ray->start;
     if (guess.quality > 0 && disti_ray_aims(tracer, ray, ray->guard - 1e-3f * tracer->field->radius)) {
         int alike = guess.off <= 0.5f * epsilon || (guess.off <= 2.0f * epsilon && guess.differ <= 0.5f * epsilon);
-        if (h == 1 && guess.quality == 3 && guess.off > 0.0f && alike) {
+        if (near && h == 1 && guess.quality == 3 && guess.off > 0.0f && alike) {
             ray->slope = guess.slope;
             ray->off = guess.off;
             /* at a crease amid the four, where the cubic is off by up to three times what it differs from the line */
@@ -10826,8 +10831,8 @@ static void disti_outline(const disti_tracer *tracer, int worker, const disti_ti
     size_t active = 0;
     for (int i = 0; i < first; i++) {
         int open = 0;
-        for (int k = 0; k < 4 && cones[i].state == DISTI_CONE_BLOCKED && cones[i].size == DISTI_LATTICE; k++) {
-            int x = cones[i].x + (k & 1 ? DISTI_LATTICE : 0), y = cones[i].y + (k & 2 ? DISTI_LATTICE : 0);
+        for (int k = 0; k < 4 && cones[i].state == DISTI_CONE_BLOCKED && cones[i].size == tile->lattice; k++) {
+            int x = cones[i].x + (k & 1 ? tile->lattice : 0), y = cones[i].y + (k & 2 ? tile->lattice : 0);
             open |= x < tile->width && y < tile->height && bench->rays[y * tile->width + x].status != DIST_RAY_HIT;
         }
         if (open) disti_cone_split(tracer, tile, bench, &cones[i], &bench->cones, &active);
@@ -10851,7 +10856,7 @@ static void disti_lattice_balls(const disti_tracer *tracer, const disti_tile *ti
     bench->least = 0.4f * disti_pixel_width(tracer, tile);
     bench->balls->clears = 0;
     memset(bench->balls->reach, 0, (size_t)(bench->width * bench->height));
-    disti_balls_look(bench, DISTI_LATTICE, 3);
+    disti_balls_look(bench, tile->lattice, 3);
 }
 
 /* Lists what a pass asks for of the block of DISTI_PASS_BLOCK * h pixels at (x0, y0), after the `active` rays that are
@@ -10883,7 +10888,7 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
             disti_ray *ray = &bench->rays[i];
             bench->depth[i] = disti_hit_depth(ray); /* of a warm start */
             if (ray->mode == DISTI_DONE) continue;
-            if (x % DISTI_LATTICE == 0 && y % DISTI_LATTICE == 0) {
+            if (x % tile->lattice == 0 && y % tile->lattice == 0) {
                 bench->index[active++] = i;
                 continue;
             }
@@ -10899,7 +10904,7 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
     }
     DIST_ASSERT(6 * DISTI_TILE_RAYS * sizeof(float) <= DISTI_REST_BYTES);
     if (tile->cheap && tile->normals) bench->gradient = (float *)(void *)bench->rest; /* the cones are done with */
-    for (int h = DISTI_LATTICE / 2; h > 0; h /= 2) {
+    for (int h = tile->lattice / 2; h > 0; h /= 2) {
         for (int pass = 1; pass <= 2; pass++) { /* between two known pixels, then amid four */
             if (bench->balls) disti_balls_look(bench, h, DISTI_MIN(h + 3, 6));
             int side = DISTI_PASS_BLOCK * h;
@@ -11460,7 +11465,7 @@ static int disti_tile_cones(int tile)
 /* The smallest tiles of a picture, the paper's tracer's apart: it should have some for every worker. */
 static int disti_tile_least(int width, int height)
 {
-    return (double)width * (double)height < 384.0 * 384.0 ? (int)DISTI_TILE_USUAL / 2 : (int)DISTI_TILE_USUAL;
+    return (double)width * (double)height < 256.0 * 256.0 ? (int)DISTI_TILE_USUAL / 2 : (int)DISTI_TILE_USUAL;
 }
 
 static size_t disti_picture_cones(int width, int height)
@@ -11571,7 +11576,7 @@ typedef struct disti_render_job {
     const dist_images *out;
     dist_tape *tape;
     int tile, across;
-    int predict; /* pixels start from what their neighbors found */
+    int lattice; /* disti_tile's; 0: pixels do not start from what their neighbors found */
     int least;   /* misses need their smallest f: for the silhouette or the relaxed boundary */
     int warm;    /* and from what the tape's picture found */
     int coned;   /* the cones stand in the tape */
@@ -12711,6 +12716,7 @@ static void disti_tile_init(const disti_render_job *job, int index, disti_tile *
     tile->y = index / job->across * job->tile;
     tile->own_width = tile->width = DISTI_MIN(job->tile, job->view->width - tile->x);
     tile->own_height = tile->height = DISTI_MIN(job->tile, job->view->height - tile->y);
+    tile->lattice = job->lattice ? job->lattice : (int)DISTI_LATTICE; /* a warm start predicts all the same */
     tile->lazy = job->lazy;
     tile->cheap = job->cheap;
 }
@@ -12780,7 +12786,7 @@ static void disti_render_task(void *arg, int index, int worker)
     disti_budget budget;
     disti_render_budget(job, &tile, &budget);
     if (tracer->how.max_queries > 0) bench.budget = &budget;
-    int predict = job->predict && !job->warm;
+    int predict = job->lattice && !job->warm;
     if (predict && tile.x + tile.width < job->view->width) tile.width++;
     if (predict && tile.y + tile.height < job->view->height) tile.height++;
     int n = tile.width * tile.height, open = 1;
@@ -12798,7 +12804,7 @@ static void disti_render_task(void *arg, int index, int worker)
         budget.left -= kept;
         for (int i = 0; i < DISTI_LEASTS; i++) bench.least_of->f[i] = 3e38f;
         if (!tracer->how.no_cones)
-            open = disti_cones(tracer, worker, &tile, &bench, job->predict ? (int)DISTI_LATTICE : (int)DISTI_CONE_LEAF,
+            open = disti_cones(tracer, worker, &tile, &bench, job->lattice ? job->lattice : (int)DISTI_CONE_LEAF,
                                job->coned ? job->tape->cones + (size_t)index * (size_t)disti_tile_cones(job->tile)
                                           : NULL);
         if (tile.lazy && job->out->stats) disti_render_meets(job, &tile, bench.stats);
@@ -12813,7 +12819,7 @@ static void disti_render_task(void *arg, int index, int worker)
         bench.stats->steepest = 0.0f;
         if (job->warm) bench.cones = 0; /* its memory is put to another use */
         if (job->warm) disti_render_warm(job, worker, &tile, &bench);
-        if (job->predict) disti_trace_lattice(tracer, worker, &tile, &bench);
+        if (job->lattice) disti_trace_lattice(tracer, worker, &tile, &bench);
         else disti_trace_all(tracer, worker, &bench, (size_t)n);
         int proven = tracer->how.certified && !(bench.stats->steepest > 0.0f);
         bench.stats->steepest = DISTI_MAX(bench.stats->steepest, steepest);
@@ -12900,12 +12906,14 @@ static double disti_view_away(const disti_view *view, const dist_field *field)
     return sqrt(disti_dot(away, away));
 }
 
-/* Neighbors say something about each other where pixels are near each other: a hundredth of the radius. */
-static int disti_render_predicts(const disti_tracer *tracer, const disti_view *view)
+/* Neighbors say something about each other where pixels are below a 50th of the radius. The lattice is 8 of them wide,
+   but no wider than .08 of the radius, so that large pixels lose no more of what is thin. */
+static int disti_render_lattice(const disti_tracer *tracer, const disti_view *view)
 {
     double f = DISTI_MIN(fabs(view->fx), fabs(view->fy));
+    double pixel = disti_view_away(view, tracer->field) / f / (double)tracer->field->radius;
     if (tracer->how.trace != DIST_TRACE_GUARDED || tracer->how.no_cones || tracer->how.no_prediction) return 0;
-    return disti_view_away(view, tracer->field) < 0.01 * (double)tracer->field->radius * f;
+    return pixel < 0.01 ? (int)DISTI_LATTICE : pixel < 0.02 ? (int)DISTI_LATTICE / 2 : 0;
 }
 
 /* Mean |f| at up to 1024 of the tape's hits, at most one in 16, evenly over the picture: how much has changed. 3e38: it
@@ -12970,7 +12978,7 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     job.view = &view;
     job.out = out;
     job.tape = tape;
-    job.predict = disti_render_predicts(&tracer, &view);
+    job.lattice = disti_render_lattice(&tracer, &view);
     job.least = out->silhouette || (tape && tracer.how.relax_band > 0.0f);
     job.lazy = !job.least && !tape && !tracer.how.pixels && !tracer.how.no_cones &&
                tracer.how.trace == DIST_TRACE_GUARDED;
@@ -12987,7 +12995,7 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     job.change = job.warm ? disti_render_change(&tracer, &view, tape) : 0.0f;
     if (!(job.change <= 4e-3f * field->radius)) job.warm = 0;
     if (job.warm) disti_run(ctx, (view.height + DISTI_TILE - 1) / DISTI_TILE, disti_nearest_task, &job);
-    job.coned = job.warm && job.predict && !tracer.how.pixels && tracer.how.max_queries == 0;
+    job.coned = job.warm && job.lattice == DISTI_LATTICE && !tracer.how.pixels && tracer.how.max_queries == 0;
     if (job.coned) disti_run(ctx, (job.count + DISTI_CONE_TILES - 1) / DISTI_CONE_TILES, disti_cones_task, &job);
     if (!listed) disti_render_order(&job);
     disti_run(ctx, job.count, listed ? disti_render_list_task : disti_render_task, &job);

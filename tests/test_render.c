@@ -431,6 +431,51 @@ TEST(silhouette_off_the_sphere_is_the_distance_to_it)
     dist_context_destroy(ctx);
 }
 
+/* Prediction also pays where pixels are a 50th to a 100th of the radius: smaller pictures never ask for more. */
+TEST(a_smaller_picture_asks_for_less)
+{
+    dist_context *ctx = shape_context();
+    dist_net *net = dist_net_load_file(ctx, "examples/model.safetensors");
+    float eye[3] = {1.14f, 0.93f, 1.63f}, at[3] = {0, 0, 0}, up[3] = {0, 1, 0};
+    static const int codes[3] = {5, 70, 200}, sizes[4] = {512, 288, 256, 160};
+    float *depth = (float *)malloc(512 * 512 * sizeof(float)), *exact = (float *)malloc(512 * 512 * sizeof(float));
+    for (int k = 0; k < 3; k++) {
+        dist_shape *shape = dist_shape_create(ctx, net, dist_net_code(net, codes[k]));
+        dist_field field = dist_shape_field(shape);
+        unsigned long long last = ~0ull;
+        for (int j = 0; j < 4; j++) {
+            dist_camera camera = dist_camera_look_at(sizes[j], sizes[j], 1.174f, eye, at, up);
+            dist_stats stats, alone;
+            dist_render_desc how = plain_how();
+            dist_images out;
+            int hits = 0, other = 0;
+            memset(&out, 0, sizeof out);
+            out.depth = depth, out.stats = &stats;
+            how.epsilon = 0.0f;
+            CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+            CHECK(stats.queries < last);
+            last = stats.queries;
+            if (j == 0) continue;
+            out.depth = exact, out.stats = &alone;
+            how.no_prediction = 1;
+            CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+            CHECK(10 * stats.queries < 6 * alone.queries);
+            for (int i = 0; i < sizes[j] * sizes[j]; i++) {
+                hits += exact[i] > 0.0f;
+                other += fabs((double)exact[i] - (double)depth[i]) > 5e-5;
+            }
+            CHECK(hits > 1000);
+            CHECK(100 * other < hits);
+            if (test_state.verbose)
+                printf("    %d pixels: %llu queries, alone %llu; %d of %d hits differ\n", sizes[j], stats.queries,
+                       alone.queries, other, hits);
+        }
+        dist_shape_destroy(shape);
+    }
+    dist_net_destroy(net), dist_context_destroy(ctx);
+    free(depth), free(exact);
+}
+
 /* 34: the outline moves over pixels, the value goes through 0 without a jump. */
 TEST(silhouette_is_continuous_and_the_mask_changes_by_single_pixels)
 {
@@ -1449,6 +1494,7 @@ int main(int argc, char **argv)
     RUN(silhouette_of_misses_is_the_smallest_f_on_92_of_100);
     RUN(silhouette_of_a_clamped_field_is_seen_from_the_plateau);
     RUN(silhouette_off_the_sphere_is_the_distance_to_it);
+    RUN(a_smaller_picture_asks_for_less);
     RUN(silhouette_is_continuous_and_the_mask_changes_by_single_pixels);
     RUN(scale_of_the_world_changes_nothing);
     RUN(far_cameras_see_what_double_sees);

@@ -1741,25 +1741,27 @@ TEST(what_neighbors_were_off_counts_by_the_distance_they_were_predicted_from)
     memset(&behind, 0, sizeof behind);
     memset(&guess, 0, sizeof guess);
     before.off = 3e-4f;
-    disti_guess_off(&guess, &before, &behind, 3, 2, 1);
+    disti_guess_off(&guess, &before, &behind, DISTI_LATTICE, 3, 2, 1);
     CHECK(!(guess.off > 0)); /* nothing is known of (4, 2), so nothing of (3, 2) */
     behind.off = 8e-4f;
-    disti_guess_off(&guess, &before, &behind, 3, 0, 1); /* (2, 0) from 2, (4, 0) from 4 pixels away */
+    disti_guess_off(&guess, &before, &behind, DISTI_LATTICE, 3, 0, 1); /* (2, 0) from 2, (4, 0) from 4 pixels away */
     CHECK_NEAR(2e-4, guess.off, 1e-9);
     CHECK_NEAR(8e-4, guess.seen, 1e-9);
-    disti_guess_off(&guess, &before, &behind, 6, 0, 2); /* (4, 0); (8, 0) is of the lattice, whatever its ray says */
+    /* (4, 0); (8, 0) is of the lattice, whatever its ray says */
+    disti_guess_off(&guess, &before, &behind, DISTI_LATTICE, 6, 0, 2);
     CHECK_NEAR(1.5e-4, guess.off, 1e-9);
     CHECK_NEAR(3e-4, guess.seen, 1e-9);
-    disti_guess_off(&guess, &before, &behind, 17, 24, 1); /* (16, 24) is of it, too; (18, 24) speaks for both */
+    /* (16, 24) is of it, too; (18, 24) speaks for both */
+    disti_guess_off(&guess, &before, &behind, DISTI_LATTICE, 17, 24, 1);
     CHECK_NEAR(4e-4, guess.off, 1e-9);
-    disti_guess_off(&guess, &before, &behind, 5, 7, 1); /* (4, 7) and (6, 7): from next to them */
+    disti_guess_off(&guess, &before, &behind, DISTI_LATTICE, 5, 7, 1); /* (4, 7) and (6, 7): from next to them */
     CHECK_NEAR(8e-4, guess.off, 1e-9);
     behind.kept = 1;
-    disti_guess_off(&guess, &before, &behind, 3, 0, 1); /* a warm start's */
+    disti_guess_off(&guess, &before, &behind, DISTI_LATTICE, 3, 0, 1); /* a warm start's */
     CHECK_NEAR(8e-4, guess.off, 1e-9);
     memset(&guess, 0, sizeof guess);
     behind.kept = 0;
-    disti_guess_off(&guess, &before, &behind, 4, 0, 4); /* both of the lattice */
+    disti_guess_off(&guess, &before, &behind, DISTI_LATTICE, 4, 0, 4); /* both of the lattice */
     CHECK(!(guess.off > 0) && !(guess.seen > 0));
 }
 

@@ -394,8 +394,8 @@ TEST(memory_is_that_of_tiles_without_a_tape_and_a_few_bytes_a_pixel_with_one)
     size_t large = net_bytes(net, 2, 1, 2048, &how);
     CHECK((double)none < 10.4e6);
     CHECK((double)large < 32e6);
-    /* a tile's cost and place among the others, too: tiles of 64 x 64 pixels, in small pictures of 32 x 32 */
-    CHECK_NEAR(5.0 * (pixels - 256.0 * 256.0) + 8.0 * (32 * 32 - 8 * 8), large - small, 0);
+    /* a tile's cost and place among the others, too: tiles of 64 x 64 pixels */
+    CHECK_NEAR(5.0 * (pixels - 256.0 * 256.0) + 8.0 * (32 * 32 - 4 * 4), large - small, 0);
     CHECK((double)(net_bytes(net, 3, 1, 1, NULL) - none) < 3.5e6); /* another worker */
     CHECK((double)(net_bytes(net, 2, 101, 1, NULL) - none) < 100 * 32e3); /* another shape: its code and biases */
     how.warm_start = 1;

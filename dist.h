@@ -9506,7 +9506,7 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
             ray->fb = 0.0f;
         } else if (f < disti_ray_near(tracer, ray, q) && q > ray->enter && !(ray->fb < 0.0f)) {
             ray->b = q; /* cones or other rays' spheres led up to this: does f fall toward it? One looks from before */
-            ray->fb = f;
+            ray->fb = DISTI_MAX(f, 1e-30f); /* 0: none */
             return disti_ray_ask(ray, DISTI_FIRST, DISTI_MAX(q - 4.0f * disti_ray_near(tracer, ray, q), ray->enter));
         }
         break;

@@ -1137,6 +1137,40 @@ TEST(a_surface_without_slope_ends_within_the_budget)
     dist_context_destroy(ctx);
 }
 
+/* f is never negative: a solid whose inside is 0. */
+static void hollow_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    (void)worker;
+    for (size_t i = 0; i < n; i++) {
+        const float *p = points + 3 * i;
+        float length = sqrtf(p[0] * p[0] + p[1] * p[1] + p[2] * p[2]), f = length - *(const float *)user;
+        sdf[i] = f > 0 ? f : 0;
+        for (int k = 0; k < 3 && gradient; k++) gradient[3 * i + (size_t)k] = f > 0 ? p[k] / length : 0;
+    }
+}
+
+/* The Lipschitz figure is too small: cones and other rays' spheres lead into the solid. */
+TEST(a_solid_whose_inside_is_0_ends_within_the_budget)
+{
+    dist_context *ctx = shape_context();
+    float radius = 0.6f;
+    dist_field field;
+    memset(&field, 0, sizeof field);
+    field.user = &radius;
+    field.eval_fn = hollow_eval;
+    field.radius = 1;
+    field.lipschitz = 0.5f;
+    for (int k = 0; k < 4; k++) { /* pixels of different widths are predicted differently */
+        dist_camera camera = shape_camera(32 << k, 32 << k);
+        dist_render_desc how = plain_how();
+        how.max_steps = k % 2 ? 30 : 0;
+        CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, &how, &picture_a), ctx);
+        CHECK(picture_a.stats.hits > 100u << (2 * k));
+        CHECK(picture_a.stats.queries < 20 * picture_a.stats.hits + 2000);
+    }
+    dist_context_destroy(ctx);
+}
+
 /* ---- budgets, statuses, free rays ------------------------------------------------------------------------------- */
 
 TEST(no_ray_asks_more_than_its_budget_and_twenty)
@@ -1993,6 +2027,7 @@ int main(int argc, char **argv)
     RUN(the_nearest_of_two_surfaces_is_hit);
     RUN(nan_from_the_field_is_not_finite_and_no_hit);
     RUN(a_surface_without_slope_ends_within_the_budget);
+    RUN(a_solid_whose_inside_is_0_ends_within_the_budget);
     RUN(no_ray_asks_more_than_its_budget_and_twenty);
     RUN(statuses_are_truthful);
     RUN(free_rays_take_directions_of_any_length);

@@ -237,11 +237,23 @@ static inline void option_floats(options *o, int n, float *values)
     for (int i = 0; i < n; i++) {
         char *end = NULL;
         double value = strtod(at, &end);
-        int good = end != at && *end == (i + 1 < n ? ',' : 0) && value >= -1e9 && value <= 1e9;
+        int good = end != at && *end == (i + 1 < n ? ',' : 0);
         if (!good) { fail("%s needs %d number%s between commas, got \"%s\"", o->name, n, n == 1 ? "" : "s", text); }
+        if (!(value >= -1e9 && value <= 1e9)) { fail("%s: numbers go from -1e9 to 1e9, got \"%s\"", o->name, text); }
         values[i] = (float)value;
         at = end + 1;
     }
+}
+
+/* Weights of a sum of losses: none below 0, and what is seen, which all but the last are of, must count. */
+static inline void option_weights(const options *o, int n, const float *weights)
+{
+    int counts = 0;
+    for (int i = 0; i < n; i++) {
+        if (weights[i] < 0.0f) { fail("%s must not be negative, got %g", o->name, (double)weights[i]); }
+        counts |= i + 1 < n && weights[i] > 0.0f;
+    }
+    if (!counts) { fail("%s: with 0 for all that is seen there is nothing to fit", o->name); }
 }
 
 /* "WxH", or one number for a square. */

@@ -82,6 +82,7 @@ static inline int option_fit(options *o, fit_options *f)
         f->rate = (float)option_number(o, 1e-9, 1e3);
     } else if (option_is(o, "--weights")) {
         option_floats(o, 3, f->weights);
+        option_weights(o, 3, f->weights);
     } else if (option_is(o, "--gradient")) {
         f->how.gradient = option_choice(o, gradients);
     } else if (option_is(o, "--trace")) {

@@ -359,6 +359,7 @@ static request read_options(int argc, char **argv)
     fit_options *o = &r.fit;
     *o = fit_defaults();
     options walk = options_begin(argc, argv, usage);
+    int told = 0; /* what the demo's shape is */
     while (option_next(&walk)) {
         if (option_is(&walk, "--start")) {
             r.start = option_text(&walk);
@@ -366,8 +367,10 @@ static request read_options(int argc, char **argv)
             r.demo = option_flag(&walk);
         } else if (option_is(&walk, "--demo-family")) {
             r.demo_family = SHAPE_SOFA + option_choice(&walk, families);
+            told = 1;
         } else if (option_is(&walk, "--demo-shape")) {
             r.demo_shape = option_int(&walk, 0, 1000000);
+            told = 1;
         } else if (option_is(&walk, "--warm")) {
             r.warm = option_flag(&walk);
         } else if (option_is(&walk, "--report")) {
@@ -376,6 +379,7 @@ static request read_options(int argc, char **argv)
             option_unknown(&walk);
         }
     }
+    if (told && !r.demo) { fail("--demo-family and --demo-shape say what --demo sees; without it they mean nothing"); }
     if (r.demo && (o->depth_path || o->target)) { fail("--demo sees its own shape; leave out --target and --depth"); }
     if (!r.demo && !o->depth_path && !o->target) {
         fail("what is seen? give --target, --depth or --demo; --help tells more");

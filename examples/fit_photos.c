@@ -718,6 +718,7 @@ static request read_options(int argc, char **argv)
             r.rate = (float)option_number(&walk, 1e-9, 1e3);
         } else if (option_is(&walk, "--weights")) {
             option_floats(&walk, 2, r.weights);
+            option_weights(&walk, 2, r.weights);
         } else if (option_is(&walk, "--ssim")) {
             r.ssim = (float)option_number(&walk, 0, 1);
         } else if (option_is(&walk, "--blur")) {

@@ -77,6 +77,7 @@ static void option_light(options *o, lighting *how)
     o->inlined = text; /* read again, as numbers */
     option_floats(o, numbers == 6 ? 6 : 3, x);
     if (!(x[0] * x[0] + x[1] * x[1] + x[2] * x[2] > 0.0f)) { fail("--light needs a direction other than 0,0,0"); }
+    if (x[3] < 0.0f || x[4] < 0.0f || x[5] < 0.0f) { fail("--light: no color below 0, got \"%s\"", text); }
     memcpy(how->lights[given].toward, x, 3 * sizeof(float));
     memcpy(how->lights[given].color, x + 3, 3 * sizeof(float));
     how->count++;

@@ -5,8 +5,15 @@
    The reference is found by small steps and bisection in double. Of a network the steps and the first bisection are
    dist_field_eval's; the hit is then moved to the root of the network in double (exact.h), its normal and the smallest
    |f| beside the outline are in double. The steps are those that the true slope proves (2.6 for networks), but at
-   least 1e-5 (networks: 5e-5). Of pictures larger than 256 x 256 (mug: 512 x 512; slow decoders, without --long: 128 x
-   128) as many pixels, spread evenly, are compared, and counted, and have a share in the gradient (`pixels_compared`).
+   least 1e-5 (networks: 5e-5).
+
+   What of a large picture is measured: a window of it (256 x 256 pixels; slower decoders: 128 x 128, the slowest: 64 x
+   64; --window: of another size), by the same camera, with the parameters that its size asks for, so that the whole
+   grid of rows is made in one to two hours; column `window`. It is the one whose shares of hits and of rays that meet
+   the bounding sphere are nearest those of the whole picture, and every pixel of it is compared. `queries_per_pixel`
+   and `operations_per_pixel` are of the window's pixels. What the whole picture takes is in a row of its own, of
+   guarded's default, without errors: parameter `whole`.
+
    Wrong pixels are counted against the surface itself, not against its epsilon:
        hole        the ray goes in by more than CLEAR, and mask is 0
        false hit   mask is 1, and the ray keeps farther than CLEAR from the surface; or misses the bounding sphere
@@ -29,12 +36,8 @@
    and _bf16 take field.coarse_fn for everything (dist_net_set_half): the bound then counts in what f was seen to be off.
    Where the processor has none of it the row says "not available".
 
-   --minutes bounds what a case's size takes beside its reference; what one does not need goes to the sizes and cases
-   after it. The rows come in order of importance (`plan`), which is the csv's. One that takes more than a 40th of the
-   time with 7 runs is made with fewer (column `runs`; the defaults of the first four methods: more than an 8th). One
-   that takes more than an 8th with a single run (of a slow decoder: a third), or more than is left, is left out, with
-   a word on stderr; never the defaults of guarded, certified and the paper's two fastest rows (of slow decoders
-   beyond 256 x 256: of guarded). "done" on stderr tells what a size took.
+   Every row is made; --seconds only bounds how often one is timed: 7 times, but no more than take so long (`runs`).
+   "done" on stderr tells what a size took.
 
    --svg draws each case and size. Lines join the epsilons of one method, or its alphas or budgets of steps; the larger
    markers are the defaults. A marker is open where the picture failed: more than 1 in 1000 pixels that should be hit is
@@ -58,8 +61,8 @@ static const char usage[] =
     "  --list             prints the cases' names, and ends\n"
     "  --size N           only pictures of N x N (default 64, 128, 256, 512 and 1024)\n"
     "  --largest N        pictures of 64 x 64 up to N x N (default 1024)\n"
-    "  --long             slow decoders (8 x 512 and with layer norm) are compared at as many pixels as others\n"
-    "  --minutes M        for each case and size on average, beside its reference (default: no bound)\n"
+    "  --window N         of larger pictures N x N pixels (default 256, 128 or 64: slow decoders have less)\n"
+    "  --seconds S        times a row only as often as takes S seconds (default: 7 times, however long)\n"
     "  --svg STEM         also plots, STEM_CASE_N.svg\n"
     "  --workers N        threads of a picture (default 1: then seconds vary least)\n"
     "  --at-once N        cases at a time, each on a core of its own, cheap ones beside slow ones; the rows of one\n"
@@ -68,7 +71,6 @@ static const char usage[] =
 
 enum { SPHERE, TORUS, BOX, RODS, BUMPS };
 #define CLEAR 2e-6
-enum { MOST_COMPARED = 256, SLOW_COMPARED = 128, SLOW_FULL = 256 }; /* pixels along a side */
 #define NEAR 0.02
 
 typedef struct scene {
@@ -79,31 +81,30 @@ typedef struct scene {
     double clamp, slope;    /* true slope at most; the field says 1 */
     double elevation;       /* of the eye, degrees */
     int code, empty, quick; /* empty: the picture shows the upper half, the shape is in the lower */
-    int slow;               /* its reference costs minutes if many pixels are compared */
-    unsigned most;          /* pixels along a side that are compared if that is more: few of them are hits */
+    int window;             /* pixels along a side of what is measured of larger pictures */
 } scene;
 
 static const scene scenes[] = {
-    {"sphere", NULL, SPHERE, {0.8, 0, 0}, 0, 1, 25, 0, 0, 1, 0, 0},
-    {"plate_1e-3", NULL, BOX, {0.6, 0.5, 5e-4}, 0, 1, 25, 0, 0, 1, 0, 0},
-    {"rods_1e-3", NULL, RODS, {1e-3, 0, 0}, 0, 1, 25, 0, 0, 1, 0, 0},
-    {"torus_grazing", NULL, TORUS, {0.66, 0.22, 0}, 0, 1, 19.3, 0, 0, 1, 0, 0},
-    {"bumps_slope_2", NULL, BUMPS, {0.7, 0.05, 20}, 0, 2, 25, 0, 0, 1, 0, 0},
-    {"box_clamped", NULL, BOX, {0.4, 0.5, 0.3}, 0.1, 1, 25, 0, 0, 1, 0, 0},
-    {"empty", NULL, SPHERE, {0.15, 0, 0}, 0, 1, 25, 0, 1, 1, 0, 0},
-    {"embedded_5", "embedded", 0, {0, 0, 0}, 0, 2.6, 25, 5, 0, 1, 0, 0},
-    {"fox", "fox", 0, {0, 0, 0}, 0, 2.6, 25, 0, 0, 1, 0, 0},
-    {"rings", "rings", 0, {0, 0, 0}, 0, 2.6, 25, 0, 0, 0, 0, 0},
-    {"bunny_relu", "bunny_relu", 0, {0, 0, 0}, 0, 2.6, 25, 0, 0, 0, 0, 0},
-    {"two_spheres_sine", "two_spheres_sine", 0, {0, 0, 0}, 0, 2.6, 25, 0, 0, 0, 0, 0},
-    {"spot", "bob_spot", 0, {0, 0, 0}, 0, 2.6, 25, 1, 0, 0, 0, 0},
-    {"round_cross_10", "round_cross", 0, {0, 0, 0}, 0, 2.6, 25, 10, 0, 0, 0, 0},
-    {"mug", "mug_camera_bottle", 0, {0, 0, 0}, 0, 2.6, 25, 0, 0, 0, 0, 512},
-    {"primitives_13", "primitives", 0, {0, 0, 0}, 0, 2.6, 25, 13, 0, 0, 0, 0},
-    {"spot_geometry", "spot_geometry", 0, {0, 0, 0}, 0, 2.6, 25, 0, 0, 0, 0, 0},
-    {"chairs_3", "chairs", 0, {0, 0, 0}, 0, 2.6, 25, 3, 0, 0, 1, 0},
-    {"spot_512", "deepsdf_512", 0, {0, 0, 0}, 0, 2.6, 25, 0, 0, 0, 1, 0},
-    {"spot_512_he", "deepsdf_512_he", 0, {0, 0, 0}, 0, 2.6, 25, 0, 0, 0, 1, 0},
+    {"sphere", NULL, SPHERE, {0.8, 0, 0}, 0, 1, 25, 0, 0, 1, 256},
+    {"plate_1e-3", NULL, BOX, {0.6, 0.5, 5e-4}, 0, 1, 25, 0, 0, 1, 256},
+    {"rods_1e-3", NULL, RODS, {1e-3, 0, 0}, 0, 1, 25, 0, 0, 1, 256},
+    {"torus_grazing", NULL, TORUS, {0.66, 0.22, 0}, 0, 1, 19.3, 0, 0, 1, 256},
+    {"bumps_slope_2", NULL, BUMPS, {0.7, 0.05, 20}, 0, 2, 25, 0, 0, 1, 256},
+    {"box_clamped", NULL, BOX, {0.4, 0.5, 0.3}, 0.1, 1, 25, 0, 0, 1, 256},
+    {"empty", NULL, SPHERE, {0.15, 0, 0}, 0, 1, 25, 0, 1, 1, 256},
+    {"embedded_5", "embedded", 0, {0, 0, 0}, 0, 2.6, 25, 5, 0, 1, 256},
+    {"fox", "fox", 0, {0, 0, 0}, 0, 2.6, 25, 0, 0, 1, 256},
+    {"rings", "rings", 0, {0, 0, 0}, 0, 2.6, 25, 0, 0, 0, 256},
+    {"bunny_relu", "bunny_relu", 0, {0, 0, 0}, 0, 2.6, 25, 0, 0, 0, 256},
+    {"two_spheres_sine", "two_spheres_sine", 0, {0, 0, 0}, 0, 2.6, 25, 0, 0, 0, 128},
+    {"spot", "bob_spot", 0, {0, 0, 0}, 0, 2.6, 25, 1, 0, 0, 128},
+    {"round_cross_10", "round_cross", 0, {0, 0, 0}, 0, 2.6, 25, 10, 0, 0, 128},
+    {"mug", "mug_camera_bottle", 0, {0, 0, 0}, 0, 2.6, 25, 0, 0, 0, 64},
+    {"primitives_13", "primitives", 0, {0, 0, 0}, 0, 2.6, 25, 13, 0, 0, 256},
+    {"spot_geometry", "spot_geometry", 0, {0, 0, 0}, 0, 2.6, 25, 0, 0, 0, 128},
+    {"chairs_3", "chairs", 0, {0, 0, 0}, 0, 2.6, 25, 3, 0, 0, 64},
+    {"spot_512", "deepsdf_512", 0, {0, 0, 0}, 0, 2.6, 25, 0, 0, 0, 64},
+    {"spot_512_he", "deepsdf_512_he", 0, {0, 0, 0}, 0, 2.6, 25, 0, 0, 0, 64},
 };
 
 typedef struct method {
@@ -142,7 +143,7 @@ static const method methods[] = {
 
 enum { SCENES = sizeof scenes / sizeof scenes[0], METHODS = sizeof methods / sizeof methods[0] };
 enum { MOST_ROWS = 2048 }; /* of a scene */
-#define EMPTY ",,,,,,,,,,,,,,,,,,,,,,,,,,,," /* the rest of a row */
+#define EMPTY ",,,,,,,,,,,,,,,,,,,,,,,,,,,,," /* the rest of a row */
 
 /* ---- fields ------------------------------------------------------------------------------------------------------ */
 
@@ -251,8 +252,8 @@ static dist_camera camera_of(const scene *s, const dist_field *field, int size)
 
 /* ---- reference --------------------------------------------------------------------------------------------------- */
 
-/* barely: goes in by no more than CLEAR; skipped: not compared */
-enum { REF_OUTSIDE = 0, REF_MISS, REF_HIT, REF_BARELY, REF_INSIDE, REF_SKIPPED };
+/* barely: goes in by no more than CLEAR */
+enum { REF_OUTSIDE = 0, REF_MISS, REF_HIT, REF_BARELY, REF_INSIDE };
 
 typedef struct reference {
     size_t n, in_sphere, hits;
@@ -307,50 +308,37 @@ static void probe_exactly(const prober *p, size_t n, const ray *rays, double *sd
     if (p->s->net) { exact_eval(p->e, n, p->at, sdf, slopes ? p->gradient : NULL, NULL); }
 }
 
-/* One pixel of each square of a picture that has more than `most` along a side, chosen by chance: not those that the
-   tracer treats in a way of their own. */
-static int is_compared(const dist_camera *camera, unsigned most, int i)
+/* The ray of pixel i, at its entry into the bounding sphere; 0: it does not meet it. */
+static int ray_of(const dist_field *field, const dist_camera *camera, const disti_view *eye, int i, ray *r)
 {
-    unsigned side = ((unsigned)camera->width + most - 1) / most;
-    unsigned x = (unsigned)(i % camera->width), y = (unsigned)(i / camera->width);
-    unsigned hash = (x / side * 73856093u) ^ (y / side * 19349663u);
-    hash = (hash ^ (hash >> 13)) * 1540483477u;
-    return x % side == (hash >> 8) % side && y % side == (hash >> 20) % side;
+    double x = ((double)(i % camera->width) + eye->first - eye->cx) / eye->fx;
+    double y = ((double)(i / camera->width) + eye->first - eye->cy) / eye->fy;
+    double length = length_of(x, y, 1);
+    double b = 0, c = 0;
+    memset(r, 0, sizeof *r);
+    for (int a = 0; a < 3; a++) {
+        double from = eye->center[a] - (double)field->center[a];
+        r->d[a] = (eye->rotation[a] * x + eye->rotation[3 + a] * y + eye->rotation[6 + a]) / length;
+        b += from * r->d[a];
+        c += from * from;
+    }
+    double root = b * b - c + (double)field->radius * (double)field->radius;
+    if (root <= 0) { return 0; }
+    r->t = r->previous = fmax(-b - sqrt(root), 0);
+    r->exit = -b + sqrt(root);
+    r->f = 1e30;
+    r->pixel = (size_t)i;
+    return 1;
 }
 
-/* The rays that meet the bounding sphere, at their entry. */
-static size_t rays_of(const dist_field *field, const dist_camera *camera, unsigned most, double origin[3],
-                      unsigned char *status, ray *rays)
+static size_t rays_of(const dist_field *field, const dist_camera *camera, double origin[3], ray *rays)
 {
     size_t count = 0;
     disti_view eye;
     disti_view_of(camera, &eye);
     for (int a = 0; a < 3; a++) { origin[a] = eye.center[a]; }
     for (int i = 0; i < camera->width * camera->height; i++) {
-        ray r;
-        double x = ((double)(i % camera->width) + eye.first - eye.cx) / eye.fx;
-        double y = ((double)(i / camera->width) + eye.first - eye.cy) / eye.fy;
-        double length = length_of(x, y, 1);
-        double b = 0;
-        double c = 0;
-        if (!is_compared(camera, most, i)) {
-            status[i] = REF_SKIPPED;
-            continue;
-        }
-        memset(&r, 0, sizeof r);
-        for (int a = 0; a < 3; a++) {
-            double from = origin[a] - (double)field->center[a];
-            r.d[a] = (eye.rotation[a] * x + eye.rotation[3 + a] * y + eye.rotation[6 + a]) / length;
-            b += from * r.d[a];
-            c += from * from;
-        }
-        double root = b * b - c + (double)field->radius * (double)field->radius;
-        if (root <= 0) { continue; }
-        r.t = r.previous = fmax(-b - sqrt(root), 0);
-        r.exit = -b + sqrt(root);
-        r.f = 1e30;
-        r.pixel = (size_t)i;
-        rays[count++] = r;
+        count += (size_t)ray_of(field, camera, &eye, i, rays + count);
     }
     return count;
 }
@@ -478,7 +466,7 @@ static size_t march(const prober *p, reference *ref, size_t active, ray *rays, r
 }
 
 static reference reference_create(dist_context *ctx, const scene *s, const dist_field *field, exact *e,
-                                  const dist_camera *camera, unsigned most)
+                                  const dist_camera *camera)
 {
     reference ref;
     prober p;
@@ -502,7 +490,7 @@ static reference reference_create(dist_context *ctx, const scene *s, const dist_
     p.e = e;
     p.at = (double *)take(3 * ref.n, sizeof(double));
     p.gradient = (double *)take(3 * ref.n, sizeof(double));
-    ref.in_sphere = rays_of(field, camera, most, ref.origin, ref.status, rays);
+    ref.in_sphere = rays_of(field, camera, ref.origin, rays);
     for (size_t i = 0; i < ref.n; i++) { ref.smallest[i] = ref.dip[i] = 1e30; }
     for (size_t i = 0; i < ref.in_sphere; i++) { ref.status[rays[i].pixel] = REF_MISS; }
     size_t hit_count = march(&p, &ref, ref.in_sphere, rays, hits, misses, sdf);
@@ -547,7 +535,7 @@ typedef struct row {
     const method *m;
     const char *parameter;
     double value;
-    int size, runs;
+    int size, window, runs; /* window: pixels along a side that were measured */
     double queries, operations, seconds, fastest, slowest, silhouette_queries, silhouette_seconds;
     double mean, p99, largest, normal, silhouette, near, violations, touched;
     double beyond; /* the violations' count */
@@ -575,7 +563,7 @@ static void compare(const reference *ref, const dist_images *out, double epsilon
     for (size_t i = 0; i < ref->n; i++) {
         int hit = out->mask[i] != 0;
         int status = ref->status[i];
-        if (status == REF_INSIDE || status == REF_SKIPPED) { continue; }
+        if (status == REF_INSIDE) { continue; }
         r->compared++;
         r->hits += (size_t)hit;
         r->unresolved += out->status[i] == DIST_RAY_UNRESOLVED;
@@ -756,18 +744,32 @@ static double render_once(const subject *j, const dist_render_desc *how, const d
     return seconds;
 }
 
-/* Of one row: timed, and how many the rest takes about as long as. Defaults of the first methods are never left out. */
-enum { RUNS = 7, OTHERS = 4, NEVER_LEFT_OUT = 4 };
+enum { RUNS = 7 };
 
-/* Renders `runs` times, but only as often as fits `limit` seconds, then once more with the silhouette, once with all
-   planes to judge, and once with a gradient. What takes more than `most` with one run is left out: runs is 0, seconds
-   those of its only picture. */
-static row picture(const subject *j, const dist_render_desc *how, int dense, int runs, double limit, double most)
+/* Times at most `runs` pictures, but after the first only what fits `limit` seconds, into r; the last one's planes and
+   stats stay in `out`. */
+static void time_pictures(const subject *j, const dist_render_desc *how, const dist_images *out, dist_tape *tape,
+                          int runs, double limit, row *r)
+{
+    double seconds[RUNS];
+    for (int i = 0; i < runs; i++) {
+        seconds[i] = render_once(j, how, out, tape);
+        if (i == 0 && runs * seconds[0] > limit) { runs = (int)fmax(1, limit / seconds[0]); }
+    }
+    r->runs = runs;
+    r->seconds = median((size_t)runs, seconds);
+    r->fastest = seconds[0];
+    r->slowest = seconds[runs - 1];
+    r->queries = (double)out->stats->queries;
+    r->operations = out->stats->operations_done;
+}
+
+/* Renders for the time, then once more with the silhouette, once with all planes to judge, and once with a gradient. */
+static row picture(const subject *j, const dist_render_desc *how, int dense, int runs, double limit)
 {
     row r;
     dist_stats stats;
     dist_images out;
-    double seconds[RUNS];
     size_t n = j->ref->n;
     dist_tape *tape = how->warm_start ? dist_tape_create(j->ctx, j->camera, how) : NULL;
     uint32_t all_alive = j->shape ? j->shape->all_alive : 0;
@@ -778,25 +780,7 @@ static row picture(const subject *j, const dist_render_desc *how, int dense, int
     out.mask = (unsigned char *)take(n, 1);
     out.stats = &stats;
     if (dense && j->shape) { j->shape->all_alive = ~(uint32_t)0; }
-    for (int i = 0; i < runs; i++) {
-        seconds[i] = render_once(j, how, &out, tape);
-        if (i > 0 || (runs + OTHERS) * seconds[0] <= limit) { continue; }
-        runs = (1 + OTHERS) * seconds[0] > most ? 0 : (int)fmax(1, limit / seconds[0] - OTHERS);
-    }
-    r.runs = runs;
-    if (runs == 0) {
-        r.seconds = seconds[0];
-        if (dense && j->shape) { j->shape->all_alive = all_alive; }
-        dist_tape_destroy(tape);
-        free(out.distance);
-        free(out.mask);
-        return r;
-    }
-    r.seconds = median((size_t)runs, seconds);
-    r.fastest = seconds[0];
-    r.slowest = seconds[runs - 1];
-    r.queries = (double)stats.queries;
-    r.operations = stats.operations_done;
+    time_pictures(j, how, &out, tape, runs, limit, &r);
     out.silhouette = take_floats(n);
     if (tape) { render_once(j, how, &out, tape); } /* the tape knows the silhouette from now on */
     r.silhouette_seconds = render_once(j, how, &out, tape);
@@ -829,15 +813,25 @@ static const char *gradient_cells(char text[64], double cosine, double error)
 static void print_row(const row *r)
 {
     char code[64], camera[64];
-    double pixels = (double)r->size * (double)r->size;
+    double pixels = (double)r->window * (double)r->window;
     printf("%s,%s,%s,%.3g,%d,%.0f,%.4f,%.1f,%.5f,%.3e,%.3e,%.3e,%.0f,%.0f,%.4g,%.3e,%.4g,%d,%.5f,%.5f,%.0f,%.0f,%.4g,"
-           "%.0f,%.5f,%.3e,%.0f,%s,%s,%.0f,%.5f\n",
+           "%.0f,%.5f,%.3e,%.0f,%s,%s,%.0f,%.5f,%d\n",
            r->s->name, r->m->name, r->parameter, r->value, r->size, r->queries, r->queries / pixels,
            r->operations / pixels, r->seconds, r->mean, r->p99, r->largest, (double)r->holes, (double)r->false_hits,
            r->normal, r->silhouette, r->violations, r->runs, r->fastest, r->slowest, (double)r->hits,
            (double)r->unresolved, r->touched, r->silhouette_queries, r->silhouette_seconds, r->near,
            r->gradient_queries, gradient_cells(code, r->code_cosine, r->code_error),
-           gradient_cells(camera, r->camera_cosine, r->camera_error), (double)r->compared, r->gradient_seconds);
+           gradient_cells(camera, r->camera_cosine, r->camera_error), (double)r->compared, r->gradient_seconds, r->window);
+    fflush(stdout);
+}
+
+/* A row that tells costs alone. */
+static void print_costs(const row *r)
+{
+    double pixels = (double)r->window * (double)r->window;
+    printf("%s,%s,%s,%.3g,%d,%.0f,%.4f,%.1f,%.5f,,,,,,,,,%d,%.5f,%.5f,%.0f,,,,,,,,,,,,,%d\n", r->s->name, r->m->name,
+           r->parameter, r->value, r->size, r->queries, r->queries / pixels, r->operations / pixels, r->seconds,
+           r->runs, r->fastest, r->slowest, (double)r->hits, r->window);
     fflush(stdout);
 }
 
@@ -888,7 +882,7 @@ enum { PANELS = sizeof panels / sizeof panels[0] };
 
 static double plot_x(const row *r, const panel_of *v)
 {
-    double pixels = (double)r->size * (double)r->size;
+    double pixels = (double)r->window * (double)r->window;
     if (v->over == OVER_SECONDS && v->y >= Y_CODE) { return r->gradient_seconds; }
     if (v->over == OVER_SECONDS) { return v->y == Y_NEAR ? r->silhouette_seconds : r->seconds; }
     if (v->over == OVER_OPERATIONS) { return r->operations / pixels; }
@@ -933,8 +927,9 @@ static int shown(const row *r, const panel_of *v)
 static void plot_rows(const char *stem, const row *rows, size_t n)
 {
     static const char *const x_labels[] = {"queries per pixel", "seconds", "multiply-adds done per pixel"};
-    char name[PATH_SIZE], path[PATH_SIZE], title[128], lines[3][64];
-    snprintf(title, sizeof title, "%s, %d x %d: error against cost", rows->s->name, rows->size, rows->size);
+    char name[PATH_SIZE], path[PATH_SIZE], title[128], of[64] = "", lines[3][64];
+    if (rows->window < rows->size) { snprintf(of, sizeof of, " (%d x %d of it)", rows->window, rows->window); }
+    snprintf(title, sizeof title, "%s, %d x %d%s: error against cost", rows->s->name, rows->size, rows->size, of);
     snprintf(name, sizeof name, "_%s_%d.svg", rows->s->name, rows->size);
     plot p = plot_begin(title, "against a reference in double; at the low edge: no larger than told there", 4);
     p.panel_width = 250;
@@ -1000,37 +995,12 @@ typedef struct sweep {
     dist_camera camera;
     reference ref;
     half halves[2]; /* F16, BF16 */
-    int quick, all_slow;     /* slow scenes compared at as many pixels as others */
-    double most, end;        /* seconds for this size, 0: no bound; when they are over */
-    double left;             /* of the case's seconds */
-    double seconds[METHODS]; /* of a default picture, here or, times four, of half the size; 0: not known */
+    int quick, size, window; /* window: 0, the scene's */
+    double limit;            /* seconds to time a row in */
     const char *svg;         /* stem of the plots' names; NULL: none */
     row *rows;
-    size_t count, count_left_out;
-    char left_out[256]; /* what was last left out, and of which parameter's values */
+    size_t count;
 } sweep;
-
-/* Rows in order of importance: a parameter's values with the methods first..end - 1. */
-typedef struct part {
-    const char *parameter;
-    int first, end;
-} part;
-
-static const part plan[] = {
-    {"default", 0, NEVER_LEFT_OUT},
-    {"epsilon", 0, 1},
-    {"epsilon", 2, 3},
-    {"default", NEVER_LEFT_OUT, 15},
-    {"epsilon", 1, 2},
-    {"epsilon", 3, 4},
-    {"epsilon", 11, 15}, /* as the pictures of the first row */
-    {"alpha", 0, 4},
-    {"steps", 0, 4},
-    {"default", 15, METHODS},
-    {"epsilon", 4, 11},
-    {"epsilon", 15, METHODS},
-};
-enum { PARTS = sizeof plan / sizeof plan[0] };
 
 static half half_create(dist_context *ctx, const scene *s, const float *code, int kind)
 {
@@ -1075,7 +1045,7 @@ static const row *picture_of(const sweep *w, const method *m, const char *parame
     if (!m->gradient && !m->uncapped) { return NULL; }
     for (size_t i = w->count; i-- > 0;) {
         const row *r = &w->rows[i];
-        if (r->m == &methods[m->trace == DIST_TRACE_PAPER ? COARSE_TO_FINE : GUARDED] && r->size == w->camera.width &&
+        if (r->m == &methods[m->trace == DIST_TRACE_PAPER ? COARSE_TO_FINE : GUARDED] && r->size == w->size &&
             strcmp(r->parameter, parameter) == 0 && r->value == value) {
             return r;
         }
@@ -1083,125 +1053,142 @@ static const row *picture_of(const sweep *w, const method *m, const char *parame
     return NULL;
 }
 
-/* Says what is left out, the values of one parameter on one line: value NULL ends it. */
-static void leave_out(sweep *w, const method *m, const char *parameter, const double *value)
-{
-    char head[160], *text = w->left_out;
-    snprintf(head, sizeof head, "left out: %s %d %s %s", w->subject.s->name, w->camera.width, m ? m->name : "",
-             parameter);
-    if (!value || strncmp(text, head, strlen(head)) != 0) {
-        if (*text) { fprintf(stderr, "%s\n", text); }
-        snprintf(text, sizeof w->left_out, "%s", value ? head : "");
-    }
-    size_t length = strlen(text);
-    if (value && strcmp(parameter, "default") != 0) {
-        snprintf(text + length, sizeof w->left_out - length, " %g", *value);
-    }
-}
-
 static void add_row(sweep *w, const method *m, const char *parameter, double value)
 {
     subject j = w->subject;
-    double *expected = &w->seconds[m - methods];
-    double limit = 1e30, most = 1e30;
     if (m->half) {
         half *h = &w->halves[m->half == DIST_HALF_BF16];
         j.field = &h->field;
         j.shape = h->shape;
     }
     if (w->count == MOST_ROWS) { fail("more than %d rows", MOST_ROWS); }
-    int by_default = strcmp(parameter, "default") == 0;
-    int first = by_default && m - methods < NEVER_LEFT_OUT;
-    int beyond = j.s->slow && w->camera.width > SLOW_FULL;
-    if (w->most > 0) {
-        double left = fmax(w->end - seconds_now(), 0);
-        limit = fmin(w->most / (first ? 8 : 40), left);
-        most = first && (!beyond || m == methods) ? 1e30 : fmin(w->most / (j.s->slow ? 3 : 8), left);
-    }
     dist_render_desc how = how_of(m, parameter, value);
     row r;
-    memset(&r, 0, sizeof r);
     const row *known = picture_of(w, m, parameter, value);
     if (known) {
-        if (known->gradient_seconds <= most) {
-            r = *known;
-            gradient(&j, &how, &r);
-        }
-    } else if (most > 0 && *expected * (1 + OTHERS) <= most) {
-        r = picture(&j, &how, m->dense, w->quick ? 3 : RUNS, limit, most);
-    }
-    if (by_default && r.seconds > 0) { *expected = r.seconds; }
-    if (!r.runs) {
-        w->count_left_out++;
-        leave_out(w, m, parameter, &value);
-        return;
+        r = *known;
+        gradient(&j, &how, &r);
+    } else {
+        r = picture(&j, &how, m->dense, w->quick ? 3 : RUNS, w->limit);
     }
     r.s = j.s;
     r.m = m;
     r.parameter = parameter;
     r.value = value;
-    r.size = w->camera.width;
+    r.size = w->size;
+    r.window = w->camera.width;
     print_row(&r);
     w->rows[w->count++] = r;
 }
 
-/* One part of the plan. The values of a quick sweep are every second of all. */
-static void sweep_values(sweep *w, const part *of)
+/* One parameter's values with every method. Those of a quick sweep are every second of all. */
+static void sweep_values(sweep *w, const char *parameter, size_t count, const double *values)
 {
-    static const double none[1] = {0};
-    int epsilon = strcmp(of->parameter, "epsilon") == 0, alpha = strcmp(of->parameter, "alpha") == 0;
-    int steps = strcmp(of->parameter, "steps") == 0;
-    const double *values = epsilon ? epsilons : alpha ? alphas : steps ? budgets : none;
-    size_t count = epsilon ? sizeof epsilons / sizeof epsilons[0] : 1;
-    count = alpha ? sizeof alphas / sizeof alphas[0] : steps ? sizeof budgets / sizeof budgets[0] : count;
-    for (int k = of->first; k < of->end; k++) {
-        const method *m = &methods[k];
+    int alpha = strcmp(parameter, "alpha") == 0, steps = strcmp(parameter, "steps") == 0;
+    for (const method *m = methods; m < methods + METHODS; m++) {
         if ((alpha && !m->by_alpha) || (steps && !m->by_steps)) { continue; }
         if ((m->dense || m->half) && !w->subject.shape) { continue; }
         if (m->warm && !w->subject.code_size) { continue; }
         if (m->half && !w->halves[m->half == DIST_HALF_BF16].shape) {
-            if (epsilon) { continue; }
-            printf("%s,%s,not available,,%d%s\n", w->subject.s->name, m->name, w->camera.width, EMPTY);
+            if (strcmp(parameter, "default") != 0) { continue; }
+            printf("%s,%s,not available,,%d%s\n", w->subject.s->name, m->name, w->size, EMPTY);
             continue;
         }
-        for (size_t i = 0; i < count; i += w->quick ? 2 : 1) { add_row(w, m, of->parameter, values[i]); }
+        for (size_t i = 0; i < count; i += w->quick ? 2 : 1) { add_row(w, m, parameter, values[i]); }
     }
 }
 
-/* One field at one size. */
-static void sweep_field(sweep *w, int size, int sizes_left)
+/* The window of `side` pixels whose shares of hits and of rays that meet the bounding sphere are nearest the whole
+   picture's; the first of several. x, y: its first column and row. */
+static void choose_window(const dist_field *field, const dist_camera *camera, const unsigned char *mask, int side,
+                          int *x, int *y)
 {
+    int n = camera->width, step = side / 4;
+    size_t columns = (size_t)n + 1;
+    double *sums[2], best = 1e30; /* over all pixels above and to the left: hits, rays */
+    disti_view eye;
+    disti_view_of(camera, &eye);
+    for (int k = 0; k < 2; k++) { sums[k] = (double *)take(columns * columns, sizeof(double)); }
+    for (int i = 0; i < n * n; i++) {
+        ray r;
+        size_t at = ((size_t)(i / n) + 1) * columns + (size_t)(i % n) + 1;
+        double of[2] = {mask[i] != 0, ray_of(field, camera, &eye, i, &r)};
+        for (int k = 0; k < 2; k++) {
+            sums[k][at] = of[k] + sums[k][at - 1] + sums[k][at - columns] - sums[k][at - columns - 1];
+        }
+    }
+    for (int v = 0; v + side <= n; v += step) {
+        for (int u = 0; u + side <= n; u += step) {
+            double off = 0;
+            for (int k = 0; k < 2; k++) {
+                const double *low = sums[k] + (size_t)v * columns + (size_t)u, *high = low + (size_t)side * columns;
+                double of = high[side] - high[0] - low[side] + low[0];
+                off += fabs(of / side / side - sums[k][columns * columns - 1] / n / n);
+            }
+            if (off < best) { best = off, *x = u, *y = v; }
+        }
+    }
+    free(sums[0]);
+    free(sums[1]);
+}
+
+/* Prints what the default of the first method takes for the whole picture, and makes the camera that of its window. */
+static void narrow(sweep *w, int side)
+{
+    row r;
+    dist_stats stats;
+    dist_images out;
+    dist_render_desc how = how_of(methods, "default", 0);
+    size_t n = (size_t)w->size * (size_t)w->size;
+    int x = 0, y = 0;
+    memset(&r, 0, sizeof r);
+    memset(&out, 0, sizeof out);
+    out.distance = take_floats(n);
+    out.mask = (unsigned char *)take(n, 1);
+    out.stats = &stats;
+    time_pictures(&w->subject, &how, &out, NULL, w->quick ? 3 : RUNS, w->limit, &r);
+    for (size_t i = 0; i < n; i++) { r.hits += out.mask[i] != 0; }
+    r.s = w->subject.s;
+    r.m = methods;
+    r.parameter = "whole";
+    r.size = r.window = w->size;
+    print_costs(&r);
+    choose_window(w->subject.field, &w->camera, out.mask, side, &x, &y);
+    w->camera.width = w->camera.height = side;
+    w->camera.cx -= (float)x;
+    w->camera.cy -= (float)y;
+    free(out.distance);
+    free(out.mask);
+}
+
+/* One field at one size. */
+static void sweep_field(sweep *w, int size)
+{
+    static const double none[1] = {0};
     size_t first = w->count;
     double start = seconds_now();
     subject *j = &w->subject;
+    int side = w->window ? w->window : j->s->window;
+    w->size = size;
     w->camera = camera_of(j->s, j->field, size);
-    unsigned compared = j->s->slow && !w->all_slow ? SLOW_COMPARED : j->s->most ? j->s->most : MOST_COMPARED;
-    w->ref = reference_create(j->ctx, j->s, j->field, j->e, &w->camera, compared);
     j->camera = &w->camera;
+    if (side < size) { narrow(w, side); }
+    w->ref = reference_create(j->ctx, j->s, j->field, j->e, &w->camera);
     j->ref = &w->ref;
     j->exact = (double *)take(6 + j->code_size, sizeof(double));
     j->weights = take_floats(w->ref.n);
     exact_gradient(j);
     double begin = seconds_now();
-    w->most = w->left / sizes_left;
-    w->end = begin + w->most;
-    for (int k = 0; k < PARTS; k++) { sweep_values(w, &plan[k]); }
-    leave_out(w, NULL, "", NULL);
-    if (w->left > 0) { w->left = fmax(w->left - (seconds_now() - begin), 1e-3); } /* 0 would be no bound */
-    for (size_t k = 0; k < METHODS; k++) { w->seconds[k] *= 4; }
+    sweep_values(w, "default", 1, none);
+    sweep_values(w, "epsilon", sizeof epsilons / sizeof epsilons[0], epsilons);
+    sweep_values(w, "alpha", sizeof alphas / sizeof alphas[0], alphas);
+    sweep_values(w, "steps", sizeof budgets / sizeof budgets[0], budgets);
     reference_destroy(&w->ref);
     free(j->exact);
     free(j->weights);
     if (w->svg && w->count > first) { plot_rows(w->svg, w->rows + first, w->count - first); }
     fprintf(stderr, "done %s %d: %d rows in %.1f s, and %.1f s for the reference\n", j->s->name, size,
             (int)(w->count - first), seconds_now() - begin, begin - start);
-}
-
-static int sizes_between(int size, int last)
-{
-    int n = 0;
-    for (; size <= last; size *= 2) { n++; }
-    return n;
 }
 
 /* w: a scene's own, with its rows. */
@@ -1238,7 +1225,7 @@ static void run_scene(sweep *w, const scene *s, int workers, int only_size, int 
     w->subject.code_size = net ? (size_t)dist_net_code_size(net) : 0;
     int last = only_size ? only_size : largest;
     for (int size = only_size ? only_size : 64; size <= last; size *= 2) {
-        sweep_field(w, size, sizes_between(size, last));
+        sweep_field(w, size);
     }
     for (int k = 0; k < 2; k++) {
         dist_shape_destroy(w->halves[k].shape);
@@ -1359,8 +1346,8 @@ static void plot_sizes(const char *stem, const row *rows, size_t n)
     char path[PATH_SIZE];
     const scene *of = NULL;
     plot_panel *a = NULL;
-    plot p = plot_begin("Error against cost as pictures grow", "distance, 99 % of the hits: error over seconds; one "
-                        "thread; lines: epsilon 1e-2 to 1e-7", 4);
+    plot p = plot_begin("Error against cost as pictures grow", "distance, 99 % of the hits: error over seconds of a "
+                        "million pixels; one thread; lines: epsilon 1e-2 to 1e-7", 4);
     p.panel_width = 270;
     p.panel_height = 180;
     for (size_t i = 0; i < n; i++) {
@@ -1369,20 +1356,21 @@ static void plot_sizes(const char *stem, const row *rows, size_t n)
         if (strcmp(r->parameter, "epsilon") != 0 || strcmp(r->m->name, ours[k]) != 0) { continue; }
         if (r->s != of) {
             of = r->s;
-            a = plot_add_panel(&p, of->name, "seconds", NULL, PLOT_LOG_X | PLOT_LOG_Y);
+            a = plot_add_panel(&p, of->name, "seconds per million pixels", NULL, PLOT_LOG_X | PLOT_LOG_Y);
             a->least[1] = 1e-8;
         }
         while (size < 7 && (64 << size) < r->size) { size++; }
         snprintf(names[k][size], sizeof names[k][size], "%s, %d", ours[k], r->size);
         plot_series *line = plot_series_of(a, names[k][size]);
         line->dashed = k;
-        plot_point *q = plot_add(line, r->seconds, r->p99);
+        double scale = 1e6 / ((double)r->window * (double)r->window);
+        plot_point *q = plot_add(line, scale * r->seconds, r->p99);
         q->open = failed(r);
-        q->x_low = r->fastest, q->x_high = r->slowest;
+        q->x_low = scale * r->fastest, q->x_high = scale * r->slowest;
     }
     p.open_means = "failed: more than 1 in 1000 pixels wrong, or hits of ours beyond their bound";
     p.notes[0] = "at the low edge: no larger than told there";
-    p.notes[1] = "sizes whose time was up before are missing";
+    p.notes[1] = "of large pictures a window";
     if (p.n) { plot_write(&p, path_of(path, stem, "_sizes.svg"), bench_origin()); }
 }
 
@@ -1390,23 +1378,16 @@ static void plot_sizes(const char *stem, const row *rows, size_t n)
 typedef struct queue {
     int waiting[SCENES];
     int first, end;
-    double seconds; /* left for those that wait; 0: no bound */
 } queue;
 
-/* The next case, or -1: every second thread takes them from the end, so that slow ones have cheap ones beside them.
-   seconds: in, what the thread's last case did not need; out, the next one's. */
-static int next_case(queue *q, int thread, double *seconds)
+/* The next case, or -1: every second thread takes them from the end, so that slow ones have cheap ones beside them. */
+static int next_case(queue *q, int thread)
 {
     int i = -1;
 #ifdef _OPENMP
 #pragma omp critical
 #endif
-    if (q->first < q->end) {
-        q->seconds += *seconds;
-        *seconds = q->seconds / (q->end - q->first);
-        q->seconds -= *seconds;
-        i = thread % 2 ? q->waiting[--q->end] : q->waiting[q->first++];
-    }
+    if (q->first < q->end) { i = thread % 2 ? q->waiting[--q->end] : q->waiting[q->first++]; }
     return i;
 }
 
@@ -1414,11 +1395,11 @@ int main(int argc, char **argv)
 {
     const char *only = NULL;
     int only_size = 0, largest = 0, workers = 1, at_once = 1, list = 0;
-    double minutes = 0;
     sweep common;
     queue cases;
     memset(&common, 0, sizeof common);
     memset(&cases, 0, sizeof cases);
+    common.limit = 1e30;
     options o = options_begin(argc, argv, usage);
     while (option_next(&o)) {
         if (option_is(&o, "--case")) {
@@ -1429,10 +1410,10 @@ int main(int argc, char **argv)
             only_size = option_int(&o, 8, 4096);
         } else if (option_is(&o, "--largest")) {
             largest = option_int(&o, 64, 4096);
-        } else if (option_is(&o, "--long")) {
-            common.all_slow = option_flag(&o);
-        } else if (option_is(&o, "--minutes")) {
-            minutes = option_number(&o, 1e-3, 1e6);
+        } else if (option_is(&o, "--window")) {
+            common.window = option_int(&o, 8, 4096);
+        } else if (option_is(&o, "--seconds")) {
+            common.limit = option_number(&o, 0, 1e6);
         } else if (option_is(&o, "--svg")) {
             common.svg = option_text(&o);
         } else if (option_is(&o, "--workers")) {
@@ -1453,17 +1434,16 @@ int main(int argc, char **argv)
     }
     if (list) { return 0; }
     if (cases.end == 0) { fail("no case is called %s: --list names them", only); }
-    cases.seconds = 60 * minutes * cases.end * (only_size ? 1 : sizes_between(64, largest));
 #ifndef _OPENMP
     if (at_once > 1) { fputs("one case at a time: compiled without OpenMP\n", stderr); }
 #endif
     row *rows = (row *)take((size_t)SCENES * MOST_ROWS, sizeof *rows);
-    size_t counts[SCENES] = {0}, n = 0, left_out = 0;
+    size_t counts[SCENES] = {0}, n = 0;
     puts("case,method,parameter,value,resolution,queries,queries_per_pixel,operations_per_pixel,seconds,mean_error,"
          "p99_error,max_error,holes,false_hits,normal_p99_degrees,silhouette_mean_error,bound_violations_per_mille,"
          "runs,seconds_min,seconds_max,hits,unresolved,touched_per_mille,queries_with_silhouette,"
          "seconds_with_silhouette,silhouette_near_mean_error,gradient_queries,code_cosine,code_norm_error,"
-         "camera_cosine,camera_norm_error,pixels_compared,gradient_seconds");
+         "camera_cosine,camera_norm_error,pixels_compared,gradient_seconds,window");
     fflush(stdout);
 #ifdef _OPENMP
 #pragma omp parallel num_threads(at_once)
@@ -1473,18 +1453,11 @@ int main(int argc, char **argv)
 #ifdef _OPENMP
         me = omp_get_thread_num();
 #endif
-        double seconds = 0;
-        for (int i = next_case(&cases, me, &seconds); i >= 0; i = next_case(&cases, me, &seconds)) {
+        for (int i = next_case(&cases, me); i >= 0; i = next_case(&cases, me)) {
             sweep w = common;
             w.rows = rows + (size_t)i * MOST_ROWS;
-            w.left = seconds;
             run_scene(&w, &scenes[i], workers, only_size, largest);
-            seconds = w.left;
             counts[i] = w.count;
-#ifdef _OPENMP
-#pragma omp atomic
-#endif
-            left_out += w.count_left_out;
         }
     }
     for (size_t i = 0; i < SCENES; i++) { /* together */
@@ -1492,7 +1465,7 @@ int main(int argc, char **argv)
         n += counts[i];
     }
     print_worst(rows, n);
-    fprintf(stderr, "in all: %d rows, %d left out for their time\n", (int)n, (int)left_out);
+    fprintf(stderr, "in all: %d rows\n", (int)n);
     if (common.svg) {
         plot_sizes(common.svg, rows, n);
         plot_losses(common.svg, rows, n);

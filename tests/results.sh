@@ -54,6 +54,14 @@ expect_nothing tables_are_whole "$work/found"
 grep -n -i -w -e nan -e inf "$folder/RESULTS.md" >"$work/found"
 expect_nothing sections_hold_numbers "$work/found"
 
+# Error against cost: every parameter's row of every method at every size, and what the whole of a picture takes.
+cat "$folder"/work_precision.csv "$folder"/work_precision_embedded_5.csv 2>/dev/null | awk -F , '/^#|^case/ { next }
+    { n[$5]++; whole[$5] += $3 == "whole"; of[$5 " " $2 " " $3 " " $4]++ }
+    END { for (k in of) if (of[k] != 1) print k ": " of[k] " rows"
+          if (n[64] < 80 || n[128] != n[64] + 1 || whole[64] || whole[128] != 1) {
+              print n[64] " rows at 64, " n[128] " at 128, " whole[128] " of the whole" } }' >"$work/found"
+expect_nothing no_row_of_error_against_cost_is_missing "$work/found"
+
 # Ours has no more holes than any row of the paper's, in the ladder and at every alpha.
 awk -F , '/^#/ || /^case/ { next } { sub(/^"[^"]*"/, "text") } { key = $3 }
     $2 ~ /^paper/ && (!(key in least) || $11 < least[key]) { least[key] = $11 }

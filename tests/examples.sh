@@ -37,6 +37,38 @@ reports() {
 }
 expect render_reports reports "$work/render" embedded --size 48
 expect fit_depth_reports reports "$work/fit_depth" --demo --size 32 --iterations 2
+# What cannot be done is refused with a sentence, and nothing else happens: NAME WORDS COMMAND...
+refuses() {
+    refused=$1 words=$2
+    shift 2
+    if "$@" >"$work/said" 2>&1; then
+        not_ok "$refused" "it ended well"
+    elif [ $? -gt 2 ] || ! grep -q -F -e "$words" "$work/said" || [ "$(wc -l <"$work/said")" -gt 2 ]; then
+        not_ok "$refused" "it should say \"$words\", and says:"
+        head -n 3 "$work/said" | sed 's/^/    /'
+    else
+        ok "$refused"
+    fi
+}
+refuses unknown_arguments "unknown argument --sise" "$work/render" embedded --sise 64 --out "$work/x"
+refuses no_model "which model?" "$work/render" --out "$work/x"
+refuses a_model_that_is_not_there "$work/none.safetensors" "$work/render" "$work/none.safetensors" --out "$work/x"
+refuses a_model_that_is_none "tests/examples.sh" "$work/mesh" tests/examples.sh --out "$work/x.ply"
+refuses pictures_of_no_pixel "WIDTHxHEIGHT" "$work/render" embedded --size 0x5 --out "$work/x"
+refuses pictures_too_large "WIDTHxHEIGHT" "$work/render" embedded --size 16385x4 --out "$work/x"
+refuses numbers_that_are_none "a number from" "$work/render" embedded --fov nan --out "$work/x"
+refuses numbers_out_of_range "numbers go from -1e9 to 1e9" "$work/render" embedded --eye 1e30,0,0 --out "$work/x"
+refuses an_eye_that_looks_at_itself "the same point" "$work/render" embedded --eye 1,1,1 --at 1,1,1 --out "$work/x"
+refuses a_code_that_is_not_there "the model stores" "$work/render" embedded --code 999999 --out "$work/x"
+refuses lights_below_0 "no color below 0" "$work/render" embedded --light 1,0,0,-1,0,0 --out "$work/x"
+refuses meshes_of_other_formats "FILE.obj is needed" "$work/mesh" embedded --out "$work/x.stl"
+refuses a_fit_of_nothing "nothing to fit" "$work/fit_depth" --demo --weights 0,0,1 --out "$work/x"
+refuses weights_below_0 "must not be negative" "$work/fit_depth" --demo --weights 1,-1,0 --out "$work/x"
+refuses a_demo_of_a_family_without_demo "they mean nothing" "$work/fit_depth" --demo-family planes --target 0 --out "$work/x"
+refuses two_observations "two observations" "$work/fit_photos" --photos none.txt --target 1 --out "$work/x"
+refuses starts_off_below_0 "must not be negative" "$work/fit_pose" --off -1,0 --out "$work/x"
+ls "$work"/x* >"$work/found" 2>/dev/null
+expect_nothing refusals_write_no_file "$work/found"
 for file in bench/*.c tools/*.c; do
     [ -e "$file" ] || continue
     name=$(basename "$file" .c)

@@ -9,8 +9,9 @@
 
    What of a large picture is measured: a window of it (256 x 256 pixels; slower decoders: 128 x 128, the slowest: 64 x
    64; --window: of another size), by the same camera, with the parameters that its size asks for, so that the whole
-   grid of rows is made in one to two hours; column `window`. It is the one whose shares of hits and of rays that meet
-   the bounding sphere are nearest those of the whole picture, and every pixel of it is compared. `queries_per_pixel`
+   grid of rows is made in one to two hours; column `window`. Of those with at least half the whole picture's share of
+   hits it is the one whose shares of hits and of rays that meet the bounding sphere are nearest the whole picture's, and
+   every pixel of it is compared. `queries_per_pixel`
    and `operations_per_pixel` are of the window's pixels. What the whole picture takes is in a row of its own, of
    guarded's default, without errors: parameter `whole`.
 
@@ -37,7 +38,7 @@
    Where the processor has none of it the row says "not available".
 
    Every row is made; --seconds only bounds how often one is timed: 7 times, but no more than take so long (`runs`).
-   "done" on stderr tells what a size took.
+   "done" on stderr tells what a size took. --have takes the rows of a size that an earlier run finished from its csv.
 
    --svg draws each case and size. Lines join the epsilons of one method, or its alphas or budgets of steps; the larger
    markers are the defaults. A marker is open where the picture failed: more than 1 in 1000 pixels that should be hit is
@@ -63,6 +64,7 @@ static const char usage[] =
     "  --largest N        pictures of 64 x 64 up to N x N (default 1024)\n"
     "  --window N         of larger pictures N x N pixels (default 256, 128 or 64: slow decoders have less)\n"
     "  --seconds S        times a row only as often as takes S seconds (default: 7 times, however long)\n"
+    "  --have FILE.csv    rows of an earlier run; sizes that it finished are not made again\n"
     "  --svg STEM         also plots, STEM_CASE_N.svg\n"
     "  --workers N        threads of a picture (default 1: then seconds vary least)\n"
     "  --at-once N        cases at a time, each on a core of its own, cheap ones beside slow ones; the rows of one\n"
@@ -997,6 +999,7 @@ typedef struct sweep {
     half halves[2]; /* F16, BF16 */
     int quick, size, window; /* window: 0, the scene's */
     double limit;            /* seconds to time a row in */
+    const char *have;        /* csv of an earlier run; NULL: none */
     const char *svg;         /* stem of the plots' names; NULL: none */
     row *rows;
     size_t count;
@@ -1098,8 +1101,9 @@ static void sweep_values(sweep *w, const char *parameter, size_t count, const do
     }
 }
 
-/* The window of `side` pixels whose shares of hits and of rays that meet the bounding sphere are nearest the whole
-   picture's; the first of several. x, y: its first column and row. */
+/* Of the windows of `side` pixels with at least half the whole picture's share of hits the one whose shares of hits and
+   of rays that meet the bounding sphere are nearest the whole picture's; the first of several. x, y: its first column
+   and row. */
 static void choose_window(const dist_field *field, const dist_camera *camera, const unsigned char *mask, int side,
                           int *x, int *y)
 {
@@ -1119,13 +1123,13 @@ static void choose_window(const dist_field *field, const dist_camera *camera, co
     }
     for (int v = 0; v + side <= n; v += step) {
         for (int u = 0; u + side <= n; u += step) {
-            double off = 0;
-            for (int k = 0; k < 2; k++) {
+            double off = 0, hits = 0;
+            for (int k = 1; k >= 0; k--) {
                 const double *low = sums[k] + (size_t)v * columns + (size_t)u, *high = low + (size_t)side * columns;
-                double of = high[side] - high[0] - low[side] + low[0];
-                off += fabs(of / side / side - sums[k][columns * columns - 1] / n / n);
+                hits = (high[side] - high[0] - low[side] + low[0]) / side / side;
+                off += fabs(hits - sums[k][columns * columns - 1] / n / n);
             }
-            if (off < best) { best = off, *x = u, *y = v; }
+            if (off < best && hits >= 0.5 * sums[0][columns * columns - 1] / n / n) { best = off, *x = u, *y = v; }
         }
     }
     free(sums[0]);
@@ -1161,6 +1165,81 @@ static void narrow(sweep *w, int side)
     free(out.mask);
 }
 
+/* One row of a csv, that of print_row; 0: it is none with errors. */
+static int parse_row(const char *line, const scene *s, row *r)
+{
+    static const char *const parameters[] = {"default", "epsilon", "alpha", "steps"};
+    enum { TEXTS = 3, NUMBERS = 34 };
+    double n[NUMBERS];
+    char text[TEXTS][64];
+    for (int k = 0; k < NUMBERS; k++) {
+        size_t length = strcspn(line, ",\n");
+        char *end = NULL;
+        if (k < TEXTS) {
+            if (length >= sizeof text[k]) { return 0; }
+            memcpy(text[k], line, length);
+            text[k][length] = 0;
+        }
+        n[k] = length ? strtod(line, &end) : -1; /* -1: there is none */
+        line += length;
+        if (k >= TEXTS && length && end != line) { return 0; }
+        if (*line != (k == NUMBERS - 1 ? '\n' : ',')) { return 0; }
+        line++;
+    }
+    memset(r, 0, sizeof *r);
+    r->s = s;
+    for (const method *m = methods; m < methods + METHODS; m++) { r->m = strcmp(m->name, text[1]) == 0 ? m : r->m; }
+    for (int k = 0; k < 4; k++) { r->parameter = strcmp(parameters[k], text[2]) == 0 ? parameters[k] : r->parameter; }
+    if (strcmp(text[0], s->name) != 0 || !r->m || !r->parameter || n[9] < 0) { return 0; }
+    r->value = n[3], r->size = (int)n[4], r->window = (int)n[33];
+    r->queries = n[5], r->operations = n[7] * n[33] * n[33], r->seconds = n[8];
+    r->mean = n[9], r->p99 = n[10], r->largest = n[11];
+    r->holes = (size_t)n[12], r->false_hits = (size_t)n[13];
+    r->normal = n[14], r->silhouette = n[15], r->violations = n[16];
+    r->runs = (int)n[17], r->fastest = n[18], r->slowest = n[19];
+    r->hits = (size_t)n[20], r->unresolved = (size_t)n[21], r->touched = n[22];
+    r->silhouette_queries = n[23], r->silhouette_seconds = n[24], r->near = n[25];
+    r->gradient_queries = n[26], r->code_cosine = n[27], r->code_error = n[28];
+    r->camera_cosine = n[29], r->camera_error = n[30];
+    r->compared = (size_t)n[31], r->gradient_seconds = n[32];
+    r->true_hits = r->hits + r->holes - r->false_hits;
+    r->beyond = floor(r->violations * (double)(r->hits - r->false_hits) / 1000 + 0.5);
+    return 1;
+}
+
+/* Takes over the rows of this size from an earlier run. 0: it had not finished it. */
+static int take_rows(sweep *w)
+{
+    const scene *s = w->subject.s;
+    size_t first = w->count;
+    const char *begin = NULL, *end = NULL;
+    char size[16];
+    snprintf(size, sizeof size, ",%d,", w->size);
+    for (const char *line = w->have, *next; line && *line; line = next) {
+        size_t length = strcspn(line, "\n"), name = strlen(s->name);
+        next = line + length + (line[length] == '\n');
+        if (strncmp(line, s->name, name) != 0 || line[name] != ',') { continue; }
+        const char *of = line; /* the fifth field */
+        for (int k = 0; k < 4 && of; k++) { of = strchr(of + (k > 0), ','); }
+        if (!of || strncmp(of, size, strlen(size)) != 0) { continue; }
+        if (w->count == MOST_ROWS) { fail("more than %d rows", MOST_ROWS); }
+        w->count += (size_t)parse_row(line, s, &w->rows[w->count]);
+        begin = begin ? begin : line;
+        end = next;
+    }
+    size_t last = sizeof budgets / sizeof budgets[0] - 1;
+    last -= w->quick ? last % 2 : 0;
+    const row *r = w->count > first ? &w->rows[w->count - 1] : NULL;
+    if (!r || strcmp(r->parameter, "steps") != 0 || r->value < budgets[last]) {
+        w->count = first;
+        return 0;
+    }
+    printf("%.*s", (int)(end - begin), begin); /* a size's rows stand together */
+    fflush(stdout);
+    fprintf(stderr, "done %s %d: %d rows, by an earlier run\n", s->name, w->size, (int)(w->count - first));
+    return 1;
+}
+
 /* One field at one size. */
 static void sweep_field(sweep *w, int size)
 {
@@ -1170,6 +1249,10 @@ static void sweep_field(sweep *w, int size)
     subject *j = &w->subject;
     int side = w->window ? w->window : j->s->window;
     w->size = size;
+    if (take_rows(w)) {
+        if (w->svg) { plot_rows(w->svg, w->rows + first, w->count - first); }
+        return;
+    }
     w->camera = camera_of(j->s, j->field, size);
     j->camera = &w->camera;
     if (side < size) { narrow(w, side); }
@@ -1414,6 +1497,9 @@ int main(int argc, char **argv)
             common.window = option_int(&o, 8, 4096);
         } else if (option_is(&o, "--seconds")) {
             common.limit = option_number(&o, 0, 1e6);
+        } else if (option_is(&o, "--have")) {
+            size_t bytes;
+            common.have = (const char *)read_file(option_text(&o), &bytes);
         } else if (option_is(&o, "--svg")) {
             common.svg = option_text(&o);
         } else if (option_is(&o, "--workers")) {

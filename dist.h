@@ -14868,8 +14868,8 @@ static dist_status disti_pfm_parse(dist_context *ctx, const char *label, const v
     if (!disti_size_mul((size_t)side[0], (size_t)side[1], &pfm->floats) ||
         !disti_size_mul(pfm->floats, (size_t)pfm->channels, &pfm->floats) || !disti_size_mul(pfm->floats, 4, &need) ||
         need > left)
-        return disti_fail(ctx, DIST_BAD_FILE, "dist_pfm_read (%s): truncated, %d of %d bytes of pixels are there", label,
-                          (double)left, (double)side[0] * (double)side[1] * (4.0 * pfm->channels));
+        return disti_fail(ctx, DIST_BAD_FILE, "dist_pfm_read (%s): truncated, %d of %d bytes of pixels are there",
+                          label, (double)left, (double)side[0] * (double)side[1] * (4.0 * pfm->channels));
     /* one white space ends the header; of \r\n the second is the picture's first byte unless there is one to spare */
     int pair = t.at[0] == '\r' && left > need && t.at[1] == '\n';
     const unsigned char *first = (const unsigned char *)bytes;

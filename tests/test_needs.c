@@ -145,6 +145,70 @@ TEST(exact_of_round_cross) { check_exact("round_cross", 10, "nets/round_cross.10
 TEST(exact_of_mug) { check_exact("mug_camera_bottle", 0, "nets/mug_camera_bottle.0.ref.f64"); }
 TEST(exact_of_fox) { check_exact("fox", 0, "nets/fox.ref.f64"); }
 
+/* How many hits of a picture are farther from the root of the net in double than their bound: by |f| over the slope
+   along the ray, both in double. */
+static void count_beyond(const char *model, int code, int certified, int size)
+{
+    dist_context *ctx = dist_context_create(NULL);
+    dist_net *net = load_net_or_skip(ctx, model);
+    if (!net) {
+        dist_context_destroy(ctx);
+        return;
+    }
+    const float *numbers = dist_net_code_size(net) ? dist_net_code(net, code) : NULL;
+    dist_shape *shape = dist_shape_create(ctx, net, numbers);
+    dist_field field = dist_shape_field(shape);
+    dist_camera camera = bench_camera(&field, size, size);
+    size_t n = (size_t)size * (size_t)size;
+    exact e = exact_create(net, numbers);
+    dist_images out;
+    dist_render_desc how;
+    memset(&out, 0, sizeof out);
+    memset(&how, 0, sizeof how);
+    how.certified = certified;
+    out.distance = take_floats(n);
+    out.error = take_floats(n);
+    out.mask = (unsigned char *)take(n, 1);
+    CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+    int hits = 0, beyond = 0;
+    double worst = 0;
+    for (size_t i = 0; i < n; i++) {
+        float origin[3], direction[3];
+        double at[3], f, gradient[3], slope = 0;
+        if (!out.mask[i]) continue;
+        dist_camera_ray(&camera, (float)(i % (size_t)size), (float)(i / (size_t)size), origin, direction);
+        for (int a = 0; a < 3; a++) at[a] = (double)origin[a] + (double)out.distance[i] * (double)direction[a];
+        exact_eval(&e, 1, at, &f, gradient, NULL);
+        for (int a = 0; a < 3; a++) slope += gradient[a] * (double)direction[a];
+        double off = fabs(f) - fabs(slope) * ((double)out.error[i] + 3e-7 * (double)out.distance[i]); /* of the ray */
+        hits++;
+        beyond += off > 0;
+        worst = fmax(worst, off);
+    }
+    if (test_state.verbose)
+        printf("    %s, certified %d: %d of %d hits beyond their bound, |f| by %.1e at most\n", model, certified, beyond,
+               hits, worst);
+    CHECK(hits > 1000);
+    CHECK(beyond * 1000 <= hits);
+    free(out.distance);
+    free(out.error);
+    free(out.mask);
+    exact_destroy(&e);
+    dist_shape_destroy(shape);
+    dist_net_destroy(net);
+    dist_context_destroy(ctx);
+}
+
+TEST(bounds_hold_against_nets_in_double)
+{
+    for (int certified = 0; certified < 2; certified++) {
+        count_beyond("embedded", 5, certified, 256);
+        count_beyond("two_spheres_sine", 0, certified, 512);
+        count_beyond("fox", 0, certified, 256);
+        count_beyond("rings", 0, certified, 256);
+    }
+}
+
 int main(int argc, char **argv)
 {
     test_begin(argc, argv);
@@ -162,5 +226,6 @@ int main(int argc, char **argv)
     RUN(exact_of_round_cross);
     RUN(exact_of_mug);
     RUN(exact_of_fox);
+    RUN(bounds_hold_against_nets_in_double);
     return test_report();
 }

@@ -1207,36 +1207,47 @@ static int parse_row(const char *line, const scene *s, row *r)
     return 1;
 }
 
+/* The line behind this one, of the csv of an earlier run; *length: this one's, with its end. */
+static const char *next_line(const char *line, size_t *length)
+{
+    *length = strcspn(line, "\n");
+    *length += line[*length] == '\n';
+    return line + *length;
+}
+
+/* Whether a line of a csv is of this scene and size: its first field and its fifth. */
+static int is_of(const sweep *w, const char *line)
+{
+    char size[16];
+    size_t name = strlen(w->subject.s->name);
+    if (strncmp(line, w->subject.s->name, name) != 0 || line[name] != ',') { return 0; }
+    for (int k = 0; k < 3 && line; k++) { line = strchr(line + name + 1, ','), name = 0; }
+    snprintf(size, sizeof size, ",%d,", w->size);
+    return line && strncmp(line, size, strlen(size)) == 0;
+}
+
 /* Takes over the rows of this size from an earlier run. 0: it had not finished it. */
 static int take_rows(sweep *w)
 {
-    const scene *s = w->subject.s;
-    size_t first = w->count;
-    const char *begin = NULL, *end = NULL;
-    char size[16];
-    snprintf(size, sizeof size, ",%d,", w->size);
-    for (const char *line = w->have, *next; line && *line; line = next) {
-        size_t length = strcspn(line, "\n"), name = strlen(s->name);
-        next = line + length + (line[length] == '\n');
-        if (strncmp(line, s->name, name) != 0 || line[name] != ',') { continue; }
-        const char *of = line; /* the fifth field */
-        for (int k = 0; k < 4 && of; k++) { of = strchr(of + (k > 0), ','); }
-        if (!of || strncmp(of, size, strlen(size)) != 0) { continue; }
-        if (w->count == MOST_ROWS) { fail("more than %d rows", MOST_ROWS); }
-        w->count += (size_t)parse_row(line, s, &w->rows[w->count]);
-        begin = begin ? begin : line;
-        end = next;
-    }
-    size_t last = sizeof budgets / sizeof budgets[0] - 1;
+    size_t first = w->count, length = 0, last = sizeof budgets / sizeof budgets[0] - 1;
     last -= w->quick ? last % 2 : 0;
+    for (const char *line = w->have, *next; line && *line; line = next) {
+        next = next_line(line, &length);
+        if (!is_of(w, line)) { continue; }
+        if (w->count == MOST_ROWS) { fail("more than %d rows", MOST_ROWS); }
+        w->count += (size_t)parse_row(line, w->subject.s, &w->rows[w->count]);
+    }
     const row *r = w->count > first ? &w->rows[w->count - 1] : NULL;
     if (!r || strcmp(r->parameter, "steps") != 0 || r->value < budgets[last]) {
         w->count = first;
         return 0;
     }
-    printf("%.*s", (int)(end - begin), begin); /* a size's rows stand together */
+    for (const char *line = w->have, *next; *line; line = next) {
+        next = next_line(line, &length);
+        if (is_of(w, line)) { printf("%.*s", (int)length, line); }
+    }
     fflush(stdout);
-    fprintf(stderr, "done %s %d: %d rows, by an earlier run\n", s->name, w->size, (int)(w->count - first));
+    fprintf(stderr, "done %s %d: %d rows, by an earlier run\n", w->subject.s->name, w->size, (int)(w->count - first));
     return 1;
 }
 

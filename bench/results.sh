@@ -12,8 +12,8 @@ shift
 mkdir -p "$folder" build || exit 1
 all_begin=$(date +%s)
 failures=
-DIST_COMMIT=$(git describe --always --dirty 2>/dev/null)
 DIST_ORIGIN=$(sh bench/machine.sh)
+DIST_COMMIT=${DIST_ORIGIN##*commit }
 export DIST_COMMIT DIST_ORIGIN
 
 # What has its section by now: the tracer first, then what is fitted with it.

@@ -186,8 +186,8 @@ static void count_beyond(const char *model, int code, int certified, int size)
         worst = fmax(worst, off);
     }
     if (test_state.verbose)
-        printf("    %s, certified %d: %d of %d hits beyond their bound, |f| by %.1e at most\n", model, certified, beyond,
-               hits, worst);
+        printf("    %s, certified %d: %d of %d hits beyond their bound, |f| by %.1e at most\n", model, certified,
+               beyond, hits, worst);
     CHECK(hits > 1000);
     CHECK(beyond * 1000 <= hits);
     free(out.distance);

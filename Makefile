@@ -10,6 +10,7 @@
 #                       build/bench_NAME --help tells what else they do
 #   make results        the paper's tables and figures with ours beside them, into bench/results/: one to two hours on
 #                       two cores that have nothing else to do
+#                       (HAVE=FILE.csv: rows of error against cost that need not be made again)
 #   make results-quick  the same in small, into build/results/: a minute or two
 #   make clean
 

@@ -151,7 +151,7 @@ mkdir -p build/work_precision || exit 1
 table_size=128
 at_once=1
 shown="torus_grazing_128 rods_1e-3_128 embedded_5_128 mug_128 fox_512"
-how="--seconds 1"
+how=
 if [ -n "$HAVE" ]; then # make results HAVE=FILE: rows of an earlier run of this sweep, under a line of their origin
     how="$how --have $HAVE"
     DIST_ORIGIN="$DIST_ORIGIN; rows made before: $(sed -n '1s/^# //p' "$HAVE")"

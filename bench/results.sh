@@ -141,20 +141,22 @@ assemble
 # scene's sweeps get their own: in all too large for a file. A plot of each scene and size is in build/work_precision;
 # some are shown.
 sweep() {
-    build/bench_work_precision --svg build/work_precision/q "$@" >build/work_precision/rows || return 1
-    head -n 1 build/work_precision/rows
+    echo "# $DIST_ORIGIN" >build/work_precision/rows
+    build/bench_work_precision --svg build/work_precision/q "$@" >>build/work_precision/rows || return 1
+    grep '^case,' build/work_precision/rows
     build/bench_work_precision --list | while read -r name; do grep "^$name," build/work_precision/rows; done
     return 0
 }
+[ -z "$HAVE" ] || cp "$HAVE" build/have.csv || exit 1
 rm -rf build/work_precision
 mkdir -p build/work_precision || exit 1
 table_size=128
 at_once=1
 shown="torus_grazing_128 rods_1e-3_128 embedded_5_128 mug_128 fox_512"
 how=
-if [ -n "$HAVE" ]; then # make results HAVE=FILE: rows of an earlier run of this sweep, under a line of their origin
-    how="$how --have $HAVE"
-    DIST_ORIGIN="$DIST_ORIGIN; rows made before: $(sed -n '1s/^# //p' "$HAVE")"
+if [ -n "$HAVE" ] && [ -z "$quick" ]; then # make results HAVE=FILE: rows of an earlier run of this sweep, under a line of their origin
+    how="--have build/have.csv"
+    DIST_ORIGIN="$DIST_ORIGIN; rows made before: $(sed -n '1s/^# //p' build/have.csv)"
 fi
 if [ -n "$quick" ]; then
     table_size=64

@@ -154,7 +154,8 @@ table_size=128
 at_once=1
 shown="torus_grazing_128 rods_1e-3_128 embedded_5_128 mug_128 fox_512"
 how=
-if [ -n "$HAVE" ] && [ -z "$quick" ]; then # make results HAVE=FILE: rows of an earlier run of this sweep, under a line of their origin
+# make results HAVE=FILE: rows of an earlier run of this sweep, under a line of their origin
+if [ -n "$HAVE" ] && [ -z "$quick" ]; then
     how="--have build/have.csv"
     DIST_ORIGIN="$DIST_ORIGIN; rows made before: $(sed -n '1s/^# //p' build/have.csv)"
 fi

@@ -1191,6 +1191,10 @@ static int parse_row(const char *line, const scene *s, row *r)
     for (const method *m = methods; m < methods + METHODS; m++) { r->m = strcmp(m->name, text[1]) == 0 ? m : r->m; }
     for (int k = 0; k < 4; k++) { r->parameter = strcmp(parameters[k], text[2]) == 0 ? parameters[k] : r->parameter; }
     if (strcmp(text[0], s->name) != 0 || !r->m || !r->parameter || n[9] < 0) { return 0; }
+    static const int counts[] = {4, 12, 13, 17, 20, 21, 31, 33};
+    for (size_t k = 0; k < sizeof counts / sizeof counts[0]; k++) {
+        if (!(n[counts[k]] >= 0 && n[counts[k]] <= 1e9)) { return 0; }
+    }
     r->value = n[3], r->size = (int)n[4], r->window = (int)n[33];
     r->queries = n[5], r->operations = n[7] * n[33] * n[33], r->seconds = n[8];
     r->mean = n[9], r->p99 = n[10], r->largest = n[11];

@@ -3441,10 +3441,9 @@ static float disti_spans_farthest(const float *from, const float *to, int n, flo
 /* Where spans end that join `end` or each other. */
 static float disti_spans_end(const float *from, const float *to, int n, float end, float *next)
 {
-    float far = disti_spans_farthest(from, to, n, end, next);
-    while (far > end) {
+    for (float far; (far = disti_spans_farthest(from, to, n, end, next)) > end;) {
         end = far;
-        far = disti_spans_farthest(from, to, n, end, next);
+        if (*next > end) break; /* none of the others joins */
     }
     return end;
 }
@@ -9612,6 +9611,7 @@ enum { DISTI_TILE = 88, DISTI_TILE_USUAL = 64, DISTI_TILE_RAYS = (DISTI_TILE + 1
 /* Spheres that samples of the tile's rays prove empty, and the parts of each ray that those of the rays around it
    cover, looked up when it sets out. A ray that is about to step skips what is covered. Pool full: no more are kept. */
 enum { DISTI_POOL = 2816, DISTI_BALLS = 12, DISTI_COVERS = 12, DISTI_SPANS = 20 * DISTI_BALLS };
+enum { DISTI_LOOKED = 64 }; /* pixels that a ray looks at: no more than eight a side */
 
 typedef struct disti_cover {
     float begin, end; /* covered without a gap; what lies before is of no use */
@@ -9816,29 +9816,34 @@ static void disti_cover_begin(const disti_bench *bench, int index, const disti_r
     int width = bench->width, x = index % width, y = index / width, h = balls->stride, window = balls->window, n = 0;
     int x0 = DISTI_MAX(x - window + h, 0) / h * h, x1 = DISTI_MIN(x + window, width - 1);
     int y0 = DISTI_MAX(y - window + h, 0) / h * h, y1 = DISTI_MIN(y + window, bench->height - 1);
+    int found[DISTI_LOOKED], count = 0; /* listed without a branch, which could not be foretold */
     for (int row = y0; row <= y1; row += h) {
         const unsigned char *reach = balls->reach + row * width;
         for (int u = x0, most = (row - y) * (row - y); u <= x1; u += h) {
-            if (reach[u] == 0 || reach[u] < most + (u - x) * (u - x) || n > DISTI_SPANS - DISTI_BALLS) continue;
-            const disti_ray *other = &bench->rays[row * width + u];
-            const disti_clear *clear = &balls->clear[balls->clear_of[row * width + u]];
-            float e[3], w[3], line[5] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
-            for (int i = 0; i < 3; i++) {
-                e[i] = other->origin[i] - ray->origin[i];
-                w[i] = other->direction[i] - ray->direction[i];
-                line[0] += e[i] * ray->direction[i];
-                line[1] += w[i] * ray->direction[i];
-            }
-            for (int i = 0; i < 3; i++) {
-                float a = e[i] - line[0] * ray->direction[i], b = w[i] - line[1] * ray->direction[i];
-                line[2] += a * a;
-                line[3] += 2.0f * a * b;
-                line[4] += b * b;
-            }
-            int count = (clear->count + 3) / 4 * 4;
-            disti_spans(clear->s, clear->square, count, line, from + n, to + n);
-            n += count;
+            DIST_ASSERT(count < DISTI_LOOKED);
+            found[count] = row * width + u;
+            count += reach[u] >= DISTI_MAX(most + (u - x) * (u - x), 1);
         }
+    }
+    for (int k = 0; k < count && n <= DISTI_SPANS - DISTI_BALLS; k++) {
+        const disti_ray *other = &bench->rays[found[k]];
+        const disti_clear *clear = &balls->clear[balls->clear_of[found[k]]];
+        float e[3], w[3], line[5] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
+        for (int i = 0; i < 3; i++) {
+            e[i] = other->origin[i] - ray->origin[i];
+            w[i] = other->direction[i] - ray->direction[i];
+            line[0] += e[i] * ray->direction[i];
+            line[1] += w[i] * ray->direction[i];
+        }
+        for (int i = 0; i < 3; i++) {
+            float a = e[i] - line[0] * ray->direction[i], b = w[i] - line[1] * ray->direction[i];
+            line[2] += a * a;
+            line[3] += 2.0f * a * b;
+            line[4] += b * b;
+        }
+        int balls_there = (clear->count + 3) / 4 * 4;
+        disti_spans(clear->s, clear->square, balls_there, line, from + n, to + n);
+        n += balls_there;
     }
     cover->end = disti_spans_end(from, to, n, cover->end, &next);
     for (cover->count = 0; cover->count < DISTI_COVERS && next < 3e38f; cover->count++) {

@@ -702,7 +702,9 @@ static request read_options(int argc, char **argv)
     while (option_next(&walk)) {
         if (option_is(&walk, "--off")) {
             option_floats(&walk, 2, r.off);
-            if (r.off[0] < 0.0f || r.off[1] < 0.0f) { fail("--off must not be negative"); }
+            if (r.off[0] < 0.0f || r.off[0] > 180.0f || r.off[1] < 0.0f || r.off[1] > 1000.0f) {
+                fail("--off must be 0 to 180 degrees and a distance of 0 to 1000");
+            }
         } else if (option_is(&walk, "--trials")) {
             r.trials = option_int(&walk, 1, 100000);
         } else if (option_is(&walk, "--refine")) {

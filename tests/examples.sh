@@ -66,7 +66,8 @@ refuses a_fit_of_nothing "nothing to fit" "$work/fit_depth" --demo --weights 0,0
 refuses weights_below_0 "must not be negative" "$work/fit_depth" --demo --weights 1,-1,0 --out "$work/x"
 refuses a_demo_of_a_family_without_demo "they mean nothing" "$work/fit_depth" --demo-family planes --target 0 --out "$work/x"
 refuses two_observations "two observations" "$work/fit_photos" --photos none.txt --target 1 --out "$work/x"
-refuses starts_off_below_0 "must not be negative" "$work/fit_pose" --off -1,0 --out "$work/x"
+refuses starts_off_below_0 "0 to 180 degrees" "$work/fit_pose" --off -1,0 --out "$work/x"
+refuses starts_off_too_far "a distance of 0 to 1000" "$work/fit_pose" --off 5,1e9 --out "$work/x"
 ls "$work"/x* >"$work/found" 2>/dev/null
 expect_nothing refusals_write_no_file "$work/found"
 for file in bench/*.c tools/*.c; do

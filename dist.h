@@ -8786,7 +8786,7 @@ typedef struct disti_ray {
     float best, fbest;  /* sample of smallest |f| */
     float error;
     float crept, fcrept; /* front where samples near the surface began to stand too far apart to prove what is between
-                            them; fcrept = 0: they do not */
+                            them; fcrept = 0: they do not. Certified: last sample of 32 noises or more */
     float sign;         /* -1: looking for the way out of the solid */
     unsigned short steps;
     unsigned char mode, status;
@@ -9024,9 +9024,9 @@ static int disti_ray_ask(disti_ray *ray, int mode, float q)
    the two f bends, and where it is as flat as that, ripples of the surface's |f| may have crossed 0 before. Over a
    bracket that is flat from the start they may have done so anywhere in it, and where what was sampled before it says
    that f crosses 0 earlier (disti_ray_bent), from there on; or, if f falls more than twice as steeply as on the way
-   along the surface that led here (disti_ray_creeps), anywhere on that way. No less than what f's noise hides, at a
-   slope that is known no better than as a 16th of the Lipschitz figure where the bracket's ends differ by no more than
-   noise. */
+   along the surface that led here (disti_ray_creeps), anywhere on that way. No less than what f's noise hides: where
+   the bracket's ends differ by no more than noise their slope is not known; then it is a 16th of the Lipschitz figure
+   or, for a certified ray that grazes, half the mean slope from its last sample well above noise, if that is less. */
 static float disti_ray_kink(const disti_tracer *tracer, const disti_ray *ray, float falls)
 {
     float most = 0.04f * tracer->field->radius, flat = tracer->noise;
@@ -9034,8 +9034,14 @@ static float disti_ray_kink(const disti_tracer *tracer, const disti_ray *ray, fl
         flat = 12.0f * disti_ray_epsilon(tracer, ray, ray->a);
     flat = DISTI_MAX(flat < most * falls ? flat / falls : most, ray->target);
     float way = ray->b - ray->crept;
-    if (ray->fcrept > 0.0f && falls * way > 2.0f * ray->fcrept) flat = DISTI_MAX(flat, DISTI_MIN(way, 0.5f * most));
-    if (ray->fa - ray->fb < 2.0f * tracer->noise) flat = DISTI_MAX(flat, 16.0f * tracer->noise / tracer->lipschitz);
+    int certified = tracer->how.certified, crept = ray->fcrept > 0.0f;
+    if (!certified && crept && falls * way > 2.0f * ray->fcrept) flat = DISTI_MAX(flat, DISTI_MIN(way, 0.5f * most));
+    if (ray->fa - ray->fb < 2.0f * tracer->noise) {
+        float slope = tracer->lipschitz / 16.0f;
+        if (certified && crept && way > 0.0f)
+            slope = DISTI_MIN(slope, 0.5f * (ray->fcrept - 2.0f * tracer->noise) / way);
+        flat = DISTI_MAX(flat, tracer->noise / slope);
+    }
     return ray->incline > -0.12f * tracer->lipschitz ? DISTI_MAX(flat, DISTI_MIN(ray->width, most)) : flat;
 }
 
@@ -9168,11 +9174,17 @@ static float disti_ray_floor(const disti_tracer *tracer, const disti_ray *ray)
 
 /* Notes the front of a step to q that was trusted, though nothing proves it, along a surface so near that ripples of f
    may cross 0 there (to 10 of the default epsilon: chosen by what decoders do, not derived), or past spheres to where f
-   is all but 0; until f is larger again. */
+   is all but 0; until f is larger again. A certified ray takes no such step; it notes the last sample well above noise,
+   from which the mean slope to a hit is known. */
 static void disti_ray_creeps(const disti_tracer *tracer, disti_ray *ray, float f, int trusted)
 {
     float ripple = 10.0f * disti_default_epsilon(tracer);
-    if (tracer->how.certified) return;
+    if (tracer->how.certified) {
+        if (!(f >= 32.0f * tracer->noise)) return;
+        ray->crept = ray->q;
+        ray->fcrept = f;
+        return;
+    }
     int skips = ray->mode == DISTI_SKIP && f < disti_ray_near(tracer, ray, ray->q);
     if (skips || (trusted && f < ripple && ray->slope > -0.3f * tracer->lipschitz)) {
         if (ray->fcrept > 0.0f) return;

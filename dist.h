@@ -2320,8 +2320,8 @@ DISTI_PLAIN(scalar, static)
      DISTI_TALL(isa)                    tiles of one vector's columns, where there are registers for sixteen rows
      DISTI_FEW(isa)                     the reverse pass of up to four rows, where other tiles are higher
      DISTI_DEPTH                        rows that one pass takes: the columns of a tile in them, 128 bytes of a row
-                                        for AVX2, stay in a first cache of 32 KiB beside the weights; wider vectors
-                                        ask for less and can use the second cache
+                                        for AVX2, fill half a first cache of 32 KiB, the weights' stream the rest;
+                                        wider vectors ask for less and can use the second cache
    A tile of R rows and V vectors keeps its sums in variables a<row><vector>: gcc holds those in registers where it
    would spill an array. A row's factor is broadcast and serves its V vectors; in the forward pass the factors of a
    tile stand side by side, elsewhere at R offsets k<row>. */
@@ -2619,6 +2619,8 @@ DISTI_PLAIN(scalar, static)
         }                                                                                                              \
     }
 
+/* Where a pass ends: no few rows are left to one of their own. */
+#define DISTI_UNTIL(from, count) ((count) - (from) <= DISTI_DEPTH + 16 ? (count) : (from) + DISTI_DEPTH)
 /* All tiles of `total` rows, eight at a time: their strips are R rows high where W vectors wide, else eight. */
 #define DISTI_EACH(kernel, isa, first, total, columns, R, W, arguments)                                                \
     for (int c = 0; c < (columns); c += W * DISTI_LANES) {                                                             \
@@ -2635,12 +2637,12 @@ DISTI_PLAIN(scalar, static)
     DISTI_FUNCTION void disti_gemm_##isa(const disti_gemm *g)                                                          \
     {                                                                                                                  \
         const int count = g->alive ? g->alive_count : g->rows, out = (g->out + 7) / 8 * 8;                             \
-        const size_t ahead = count > DISTI_DEPTH ? (size_t)g->rows * 8 : 256;                                          \
+        const size_t ahead = DISTI_UNTIL(0, count) < count ? (size_t)g->rows * 8 : 256;                                \
         if (g->mask) memset(g->mask, 0, (size_t)(unsigned)out * sizeof(uint64_t));                                     \
         int to = 0;                                                                                                    \
         do {                                                                                                           \
             const int from = to;                                                                                       \
-            to = DISTI_MIN(from + DISTI_DEPTH, count);                                                                 \
+            to = DISTI_UNTIL(from, count);                                                                             \
             int first = 0;                                                                                             \
             DISTI_TALL(isa)                                                                                            \
             DISTI_EACH(gemm, isa, first, out, g->columns, R, W, (g, n, c, from, to, ahead))                            \
@@ -2663,7 +2665,7 @@ DISTI_PLAIN(scalar, static)
         int to = 0, k[8];                                                                                              \
         do {                                                                                                           \
             const int from = to;                                                                                       \
-            to = DISTI_MIN(from + DISTI_DEPTH, count);                                                                 \
+            to = DISTI_UNTIL(from, count);                                                                             \
             DISTI_FEW(isa)                                                                                             \
             DISTI_EACH(back, isa, 0, rows, g->columns, R, W,                                                           \
                        (g, disti_back_rows(g, rows, n, k), rows - n, c, from, to))                                     \
@@ -2867,7 +2869,7 @@ DISTI_FUNCTION __m256 disti_keep_avx2(__m256 v, int bits)
     const __m256i both = _mm256_and_si256(_mm256_set1_epi32(bits), lane);
     return _mm256_and_ps(v, _mm256_castsi256_ps(_mm256_cmpeq_epi32(both, lane)));
 }
-#define DISTI_DEPTH 176
+#define DISTI_DEPTH 112
 #define DISTI_GREATER(a, b) _mm256_max_ps(a, b)
 #define DISTI_ABS(v) _mm256_andnot_ps(_mm256_set1_ps(-0.0f), v)
 DISTI_KERNELS(avx2, 4, 3)
@@ -3344,6 +3346,7 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_RELU_ROWS
 #undef DISTI_PLAIN
 #undef DISTI_LAST_LAYER
+#undef DISTI_UNTIL
 #undef DISTI_EACH
 #undef DISTI_DRIVERS
 #undef DISTI_KERNELS

@@ -11453,7 +11453,7 @@ struct dist_tape {
     unsigned char *status;  /* (pixels): DIST_RAY_*, with DISTI_TAPE_* bits */
     float *sample;          /* (pixels, samples, 4), paper's tracer only */
     /* (pixels), warm start only: slope at a hit, |f| at a miss; where the cones stopped; disti_nearest_task's, and what
-       f is not below from there on as far as disti_warm_beside looked */
+       f is not below from there on as far as disti_warm_beside looked, but where a miss's |f| is least */
     float *value, *start, *nearest, *beside;
     disti_cone *cones;      /* warm start: all of the picture, asked for beside those of other tiles */
     unsigned turn;          /* warm renders so far */
@@ -12450,8 +12450,10 @@ static int disti_warm_near(disti_warm *warm, int i, float f)
         warm->moved[i] = 3e38f;
         warm->bench->depth[i] = disti_hit_depth(ray);
     } else if (ray->moved) {
-        ray->mode = DISTI_DONE;
-        warm->tape->beside[disti_warm_pixel(warm, i)] = ray->f;
+        float off = ray->s - ray->best, other = 0.01f * warm->tracer->field->radius;
+        int same = ray->status == DIST_RAY_MISS && off < ray->width && -off < ray->width;
+        ray->mode = DISTI_DONE; /* a miss that came down to its least, which has a bound of its own, met no other */
+        warm->tape->beside[disti_warm_pixel(warm, i)] = same ? DISTI_MAX(ray->f, other) : ray->f;
     } else {
         disti_ray_end(ray, DIST_RAY_MISS, ray->s, ray->f, 0.0f);
         return disti_warm_beside(warm, i, 0);

@@ -9,6 +9,8 @@
    bytes: most memory held beside the caller's planes and the weights. moved: mean change of depth of a step, in radii;
    in the warm rows Adam's rate is lowered until that is at most 5e-4. render, backward: seconds of these parts;
    their rates: dense multiply-adds (backward: a forward and a reverse pass a point) at the peak, over the time.
+   network_rate: as the render's rate, over the time spent in the network alone, in blocks of points as the tracer asks
+   them.
    The camera is 2.2 radii away with a focal length of 385 pixels at 512, as in bench_trace. */
 #define DIST_IMPLEMENTATION
 #include "../dist.h"
@@ -77,6 +79,31 @@ static void meter_free(void *user, void *p, size_t bytes)
     free(q - q[-1]);
 }
 
+/* ---- time in the network ----------------------------------------------------------------------------------------- */
+
+enum { WORKERS_MOST = 256, APART = 16 }; /* APART: doubles from one worker's place to the next, not in one cache line */
+static void (*network_eval)(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient);
+static double network_seconds[WORKERS_MOST * APART];
+
+/* The field's own eval_fn, timed. */
+static void timed_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    double start = seconds_now();
+    network_eval(user, worker, n, points, sdf, gradient);
+    network_seconds[worker * APART] += seconds_now() - start;
+}
+
+/* Of all workers, since the last call. */
+static double network_spent(void)
+{
+    double sum = 0;
+    for (int i = 0; i < WORKERS_MOST; i++) {
+        sum += network_seconds[i * APART];
+        network_seconds[i * APART] = 0;
+    }
+    return sum;
+}
+
 /* ---- the step ---------------------------------------------------------------------------------------------------- */
 
 static dist_net *made_net(dist_context *ctx, int layers, int width, int code_size, int skip)
@@ -129,6 +156,10 @@ static stepper stepper_create(dist_context *ctx, const dist_net *net, int code, 
     if (dist_net_code(net, code)) { memcpy(s.code, dist_net_code(net, code), s.code_size * sizeof(float)); }
     s.shape = dist_shape_create(ctx, net, s.code);
     s.field = dist_shape_field(s.shape);
+    if (dist_context_workers(ctx) <= WORKERS_MOST) {
+        network_eval = s.field.eval_fn;
+        s.field.eval_fn = timed_eval;
+    }
     s.camera = bench_camera(&s.field, size, size);
     s.how.warm_start = warm;
     s.tape = dist_tape_create(ctx, &s.camera, &s.how);
@@ -176,8 +207,8 @@ static void stepper_destroy(stepper *s)
     free(s->adam.moments);
 }
 
-/* One step; its seconds, and those of the render and the backward pass. */
-static double step_once(stepper *s, double *render, double *backward)
+/* One step; its seconds, those of the render and the backward pass, and the workers' in the render's network. */
+static double step_once(stepper *s, double *render, double *backward, double *network)
 {
     dist_gradients grads;
     memset(&grads, 0, sizeof grads);
@@ -188,9 +219,11 @@ static double step_once(stepper *s, double *render, double *backward)
     memset(s->d_out.silhouette, 0, s->n * sizeof(float));
     memset(s->d_code, 0, s->code_size * sizeof(float));
     dist_shape_set_code(s->shape, s->code);
+    network_spent();
     double render_start = seconds_now();
     dist_render(s->ctx, &s->field, &s->camera, &s->how, &s->out, s->tape);
     *render = seconds_now() - render_start;
+    *network = network_spent();
     dist_loss_depth(s->n, s->out.depth, s->target, s->out.mask, 10.0f, s->d_out.depth);
     dist_loss_silhouette(s->n, s->out.silhouette, s->target_mask, 1.0f, s->d_out.silhouette);
     dist_loss_code(s->code_size, s->code, 1.0f / (float)s->code_size, s->d_code);
@@ -218,24 +251,25 @@ static double step_moved(stepper *s)
 }
 
 typedef struct row {
-    double seconds, queries, backward_points, peak, moved, hits, render, backward, dense, rate;
+    double seconds, queries, backward_points, peak, moved, hits, render, backward, network, dense, rate;
 } row;
 
 /* The median of `steps` steps, after one that is not counted. */
 static row run_steps(stepper *s, int steps)
 {
     static double seconds[STEPS_MOST], queries[STEPS_MOST], points[STEPS_MOST], moved[STEPS_MOST], peaks[STEPS_MOST];
-    static double renders[STEPS_MOST], backwards[STEPS_MOST];
-    double taken, render, backward;
+    static double renders[STEPS_MOST], backwards[STEPS_MOST], networks[STEPS_MOST];
+    double taken, render, backward, network;
     row r;
     memset(&r, 0, sizeof r);
     for (int i = -1; i < steps; i++) {
-        double once = step_once(s, &render, &backward);
+        double once = step_once(s, &render, &backward, &network);
         double change = step_moved(s);
         if (i < 0) { continue; }
         seconds[i] = once;
         renders[i] = render;
         backwards[i] = backward;
+        networks[i] = network / dist_context_workers(s->ctx);
         queries[i] = (double)s->stats.queries;
         points[i] = (double)s->stats.backward_points;
         moved[i] = change;
@@ -248,6 +282,7 @@ static row run_steps(stepper *s, int steps)
     r.peak = median((size_t)steps, peaks);
     r.render = median((size_t)steps, renders);
     r.backward = median((size_t)steps, backwards);
+    r.network = median((size_t)steps, networks);
     r.dense = r.queries > 0 ? s->stats.operations / (double)s->stats.queries : 0;
     r.hits = (double)s->stats.hits;
     r.rate = (double)s->adam.rate;
@@ -263,10 +298,11 @@ static void print_row(const char *name, const char *mode, int width, int height,
     double render_rate = r->render > 0 ? r->queries * 2.0 * r->dense / (r->render * r->peak * 1e9) : 0;
     double backward_rate =
         r->backward > 0 ? r->backward_points * 4.0 * r->dense / (r->backward * r->peak * 1e9) : 0;
-    printf("%s,%s,%s,%d,%.5f,%.0f,%.0f,%.1f,%.4f,%.0f,%.0f,%.2f,%.1e,%.5f,%.5f,%.2f,%.2f,%.1e\n", name, mode, resolution,
+    double network_rate = r->network > 0 ? r->queries * 2.0 * r->dense / (r->network * r->peak * 1e9) : 0;
+    printf("%s,%s,%s,%d,%.5f,%.0f,%.0f,%.1f,%.4f,%.0f,%.0f,%.2f,%.1e,", name, mode, resolution,
            dist_context_workers(ctx), r->seconds, r->queries, r->backward_points, r->peak, r->seconds / whole,
-           (double)bytes, r->hits, r->hits > 0 ? r->queries / r->hits : 0, r->moved,
-           r->render, r->backward, render_rate, backward_rate, r->rate);
+           (double)bytes, r->hits, r->hits > 0 ? r->queries / r->hits : 0, r->moved);
+    printf("%.5f,%.5f,%.2f,%.2f,%.1e,%.2f\n", r->render, r->backward, render_rate, backward_rate, r->rate, network_rate);
     fflush(stdout);
 }
 
@@ -374,7 +410,7 @@ int main(int argc, char **argv)
     dist_context *ctx = dist_context_create(&desc);
     check(ctx);
     puts("case,mode,resolution,threads,seconds,queries,backward_points,peak_gflops,ratio,bytes,hits,"
-         "queries_per_hit,moved,render,backward,render_rate,backward_rate,rate");
+         "queries_per_hit,moved,render,backward,render_rate,backward_rate,rate,network_rate");
     for (int i = 0; i < CASES; i++) {
         int wanted = set.only ? strcmp(set.only, cases[i].name) == 0 : !set.quick || cases[i].quick;
         if (wanted) { run_case(ctx, &cases[i], &set, &memory); }

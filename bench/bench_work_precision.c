@@ -1230,19 +1230,28 @@ static int is_of(const sweep *w, const char *line)
     return line && strncmp(line, size, strlen(size)) == 0;
 }
 
-/* Takes over the rows of this size from an earlier run. 0: it had not finished it. */
+/* Whether it tells of a whole picture: its third field. It is no row of the sweep. */
+static int is_whole(const char *line)
+{
+    for (int k = 0; k < 2 && line; k++) { line = strchr(line, ','), line += line != NULL; }
+    return line && strncmp(line, "whole,", 6) == 0;
+}
+
+/* Takes over the rows of this size from an earlier run. 0: it had not finished it, or one of them is damaged. */
 static int take_rows(sweep *w)
 {
     size_t first = w->count, length = 0, last = sizeof budgets / sizeof budgets[0] - 1;
+    int damaged = 0;
     last -= w->quick ? last % 2 : 0;
     for (const char *line = w->have, *next; line && *line; line = next) {
         next = next_line(line, &length);
         if (!is_of(w, line)) { continue; }
         if (w->count == MOST_ROWS) { fail("more than %d rows", MOST_ROWS); }
-        w->count += (size_t)parse_row(line, w->subject.s, &w->rows[w->count]);
+        if (parse_row(line, w->subject.s, &w->rows[w->count])) { w->count++; }
+        else { damaged |= !is_whole(line); }
     }
     const row *r = w->count > first ? &w->rows[w->count - 1] : NULL;
-    if (!r || strcmp(r->parameter, "steps") != 0 || r->value < budgets[last]) {
+    if (damaged || !r || strcmp(r->parameter, "steps") != 0 || r->value < budgets[last]) {
         w->count = first;
         return 0;
     }

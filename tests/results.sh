@@ -89,3 +89,16 @@ sed 's/"[^"]*Adam",/adam,/; s/"and Gauss-Newton",/newton,/; s/"and new tries",/t
 expect_nothing new_tries_lose_no_camera "$work/found"
 
 expect readme_holds_the_tables_of_bench_results sh bench/readme.sh --check
+
+# Rows of an earlier run are taken over, and made again where one of them is damaged, wherever it stands.
+sweep="build/bench_work_precision --case sphere --size 64 --quick"
+taken() { $sweep --have "$1" 2>&1 >/dev/null | grep -c 'by an earlier run'; }
+$sweep >"$work/first.csv" 2>/dev/null
+rows=$(grep -c ^sphere "$work/first.csv")
+again=$(taken "$work/first.csv")
+for row in $((rows / 2)) "$rows"; do # a count that is not there
+    awk -F , -v OFS=, -v row="$row" '/^sphere/ && ++n == row { $18 = "" } { print }' "$work/first.csv" >"$work/second.csv"
+    again="$again $(taken "$work/second.csv")"
+done
+[ "$rows" -gt 10 ] && [ "$again" = "1 0 0" ] && ok only_whole_runs_are_taken_over ||
+    not_ok only_whole_runs_are_taken_over "$rows rows; taken over: $again, not 1 0 0"

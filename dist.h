@@ -2472,6 +2472,8 @@ DISTI_PLAIN(scalar, static)
         const uint64_t bits = g->mask ? g->mask[k[i]] >> c : ~(uint64_t)0;                                             \
         DISTI_X##V(DISTI_STORE_KEEP1, i)                                                                               \
     }
+#define DISTI_STORE_SOON1(i, j) DISTI_STORE(d_x + k##i * (DISTI_BLOCK / 8) + j * DISTI_LANES, a##i##j);
+#define DISTI_STORE_SOON(i, V) if (i < count) { DISTI_X##V(DISTI_STORE_SOON1, i) }
 
 #define DISTI_BACK_TILE(name, R, V)                                                                                    \
     DISTI_NOINLINE DISTI_FUNCTION void disti_back_##name(const disti_gemm_back *g, const int *k, int count, int c,     \
@@ -2512,7 +2514,11 @@ DISTI_PLAIN(scalar, static)
             for (; o < end; o++)                                                                                       \
                 DISTI_STEP(R, V, DISTI_APART, weights + (o >> 3) * panel + (o & 7), d_y + o * DISTI_BLOCK)             \
         }                                                                                                              \
-        DISTI_Y##R(DISTI_STORE_KEEP, V)                                                                                \
+        if (to < (g->alive_out ? g->alive_out_count : g->out)) { /* the last pass applies the mask */                  \
+            DISTI_Y##R(DISTI_STORE_SOON, V)                                                                            \
+        } else {                                                                                                       \
+            DISTI_Y##R(DISTI_STORE_KEEP, V)                                                                            \
+        }                                                                                                              \
     }
 
 /* Only the last vector of a row can be a part of one. */
@@ -3333,6 +3339,8 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_OFFSET
 #undef DISTI_RETURN1
 #undef DISTI_RETURN
+#undef DISTI_STORE_SOON1
+#undef DISTI_STORE_SOON
 #undef DISTI_STORE_KEEP1
 #undef DISTI_STORE_KEEP
 #undef DISTI_BACK_TILE

@@ -106,9 +106,9 @@ if $CC -m32 "$work/probe.c" -o "$work/probe" 2>/dev/null && "$work/probe"; then
 elif have arm-linux-gnueabihf-gcc && have qemu-arm; then
     expect pointers_of_32_bits arm-linux-gnueabihf-gcc -std=c99 $warnings -Wmissing-prototypes -DSMALL_LIBRARY \
         -c tests/small.c -o "$work/c.o"
-elif have arm-none-eabi-gcc; then
+elif echo '#include <math.h>' | arm-none-eabi-gcc -mcpu=cortex-m4 -fsyntax-only -x c - 2>/dev/null; then # with a libc
     expect pointers_of_32_bits arm-none-eabi-gcc -mcpu=cortex-m4 -std=c99 $warnings -Wmissing-prototypes \
         -DSMALL_LIBRARY -c tests/small.c -o "$work/c.o"
 else
-    skip pointers_of_32_bits "neither -m32 nor an arm compiler works here"
+    skip pointers_of_32_bits "neither -m32 nor an arm compiler with its libc works here"
 fi

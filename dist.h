@@ -6370,6 +6370,16 @@ static int disti_net_few(const dist_shape *shape, const disti_block *b, size_t n
            net->layers > 1 && !shape->ctx->blas.sgemm_fn;
 }
 
+/* How many of up to a block's points are evaluated next. The other kernels take whole vectors of points, so some counts
+   go faster as two parts, one of them of few points, where a layer is long enough to pay for a second pass over it. */
+static size_t disti_net_part(const dist_shape *shape, const disti_block *b, size_t n)
+{
+    const size_t few = DISTI_FEW_POINTS, vectors = 2 * 16;
+    if ((size_t)b->kernels.few_points < few || !disti_net_few(shape, b, few)) return n;
+    if (dist_net_operations(shape->net, 1) < 1e5) return n;
+    return n > few && n <= 2 * few ? few : n > vectors && n <= vectors + few ? vectors : n;
+}
+
 /* disti_net_forward of a few points: activations stand (points, max_rows), so that weights fill the vectors. The last
    layer's input is put into rows, of which alive ones are written. */
 static const float *disti_few_forward(const dist_shape *shape, disti_block *b, disti_counter *counter)
@@ -6661,8 +6671,8 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
         disti_group_layout(net, disti_lane(shape->ctx, worker) + bytes, &own, &g);
     }
     if (d_code) disti_fold_begin(net, &own);
-    for (size_t at = 0; at < n; at += DISTI_BLOCK, j++) {
-        size_t count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK);
+    for (size_t at = 0, count; at < n; at += count, j++) {
+        count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK);
         if (j == blocks && shape->groups > own.values && n - at >= DISTI_GROUP_LEAST) {
             int part = (int)DISTI_MIN(n - at, (size_t)DISTI_GROUP_POINTS);
             counter->done += disti_group_forward(shape, &own.kernels, &g, part, points + 3 * at);
@@ -6678,6 +6688,7 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
         if (j < blocks) {
             disti_group_block(net, &g, j, &b);
         } else {
+            count = disti_net_part(shape, &b, count);
             disti_block_load(shape, &b, count, points + 3 * at);
             const float *x = disti_net_few(shape, &b, count) ? disti_few_forward(shape, &b, counter)
                                                              : disti_net_forward(shape, &b, NULL, counter);

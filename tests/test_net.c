@@ -490,6 +490,7 @@ TEST(a_few_points_have_the_bits_of_many)
 {
     enum { MANY = 48 };
     const model_desc descs[] = {{.hidden = 4, .width = 131, .skip = 2, .code_size = 3},
+                                {.hidden = 7, .width = 147, .skip = 3, .code_size = 3}, /* in parts: disti_net_part */
                                 {.hidden = 2, .width = 20},
                                 {.hidden = 3, .width = 33, .fourier = 1, .levels = 3},
                                 {.hidden = 1, .width = 9}};
@@ -504,7 +505,7 @@ TEST(a_few_points_have_the_bits_of_many)
         test_random random = test_random_seed(7);
         test_random_fill(&random, 3 * MANY, points, -0.9f, 0.9f);
         field.eval_fn(field.user, 0, MANY, points, many, NULL);
-        for (int n = 1; n <= 17; n++) {
+        for (int n = 1; n <= MANY; n++) {
             for (int at = 0; at + n <= MANY; at += n) {
                 field.eval_fn(field.user, 0, (size_t)n, points + 3 * at, few, NULL);
                 CHECK_BYTES((size_t)n * sizeof(float), many + at, few);

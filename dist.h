@@ -6376,7 +6376,7 @@ static size_t disti_net_part(const dist_shape *shape, const disti_block *b, size
 {
     const size_t few = DISTI_FEW_POINTS, vectors = 2 * 16;
     if ((size_t)b->kernels.few_points < few || !disti_net_few(shape, b, few)) return n;
-    if (dist_net_operations(shape->net, 1) < 1e5) return n;
+    if (dist_net_operations(shape->net, 1) < 100000) return n;
     return n > few && n <= 2 * few ? few : n > vectors && n <= vectors + few ? vectors : n;
 }
 

@@ -2335,9 +2335,12 @@ DISTI_PLAIN(scalar, static)
 #define DISTI_X3(M, i) M(i, 0) M(i, 1) M(i, 2)
 #define DISTI_X4(M, i) M(i, 0) M(i, 1) M(i, 2) M(i, 3)
 #define DISTI_Y1(M, V) M(0, V)
-#define DISTI_Y4(M, V) M(0, V) M(1, V) M(2, V) M(3, V)
-#define DISTI_Y8(M, V) DISTI_Y4(M, V) M(4, V) M(5, V) M(6, V) M(7, V)
-#define DISTI_Y12(M, V) DISTI_Y8(M, V) M(8, V) M(9, V) M(10, V) M(11, V)
+#define DISTI_Y2(M, V) M(0, V) M(1, V)
+#define DISTI_Y4(M, V) DISTI_Y2(M, V) M(2, V) M(3, V)
+#define DISTI_Y6(M, V) DISTI_Y4(M, V) M(4, V) M(5, V)
+#define DISTI_Y8(M, V) DISTI_Y6(M, V) M(6, V) M(7, V)
+#define DISTI_Y10(M, V) DISTI_Y8(M, V) M(8, V) M(9, V)
+#define DISTI_Y12(M, V) DISTI_Y10(M, V) M(10, V) M(11, V)
 #define DISTI_Y16(M, V) DISTI_Y12(M, V) M(12, V) M(13, V) M(14, V) M(15, V)
 
 #define DISTI_ZERO1(i, j) DISTI_VEC a##i##j = DISTI_SET1(0.0f);
@@ -2938,13 +2941,19 @@ DISTI_BACK_TILE(few_avx512, 4, 3)
     _mm256_storeu_ps(p, _mm512_maskz_extractf32x8_ps((__mmask8)0xff, v, 0)); \
     _mm256_storeu_ps(q, _mm512_maskz_extractf32x8_ps((__mmask8)0xff, v, 1));
 DISTI_KERNELS(avx512, 8, 3)
+DISTI_FEW_TILE(two_avx512, 2, 4)
 DISTI_FEW_TILE(four_avx512, 4, 4)
+DISTI_FEW_TILE(six_avx512, 6, 4)
 DISTI_FEW_TILE(eight_avx512, 8, 2)
+DISTI_FEW_TILE(ten_avx512, 10, 2)
 DISTI_FEW_TILE(twelve_avx512, 12, 2)
 static void disti_few_avx512(const disti_few *g)
 {
-    if (g->points <= 4) disti_few_four_avx512(g);
+    if (g->points <= 2) disti_few_two_avx512(g);
+    else if (g->points <= 4) disti_few_four_avx512(g);
+    else if (g->points <= 6) disti_few_six_avx512(g);
     else if (g->points <= 8) disti_few_eight_avx512(g);
+    else if (g->points <= 10) disti_few_ten_avx512(g);
     else disti_few_twelve_avx512(g);
 }
 #undef DISTI_ABS
@@ -3309,8 +3318,11 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_X3
 #undef DISTI_X4
 #undef DISTI_Y1
+#undef DISTI_Y2
 #undef DISTI_Y4
+#undef DISTI_Y6
 #undef DISTI_Y8
+#undef DISTI_Y10
 #undef DISTI_Y12
 #undef DISTI_Y16
 #undef DISTI_ZERO1
@@ -5720,6 +5732,7 @@ struct dist_shape {
     float half_error; /* largest of 16 bits at the samples of disti_shape_slope */
     int half;         /* what the net had then */
     int groups;       /* disti_groups_pay */
+    int wide;         /* its net's queries cost enough for one more look at a batch's points to pay */
     int many;         /* dist_field.many: two thirds or less of a block's multiply-adds are left with bounds */
     uint32_t all_alive; /* bit l: the samples of disti_shape_slope met no dead unit at layer l's input */
     dist_shape *texture; /* the net that colors it, with [code, color code] folded in; NULL: none */
@@ -6375,9 +6388,9 @@ static int disti_net_few(const dist_shape *shape, const disti_block *b, size_t n
 static size_t disti_net_part(const dist_shape *shape, const disti_block *b, size_t n)
 {
     const size_t few = DISTI_FEW_POINTS, vectors = 2 * 16;
-    if ((size_t)b->kernels.few_points < few || !disti_net_few(shape, b, few)) return n;
-    if (dist_net_operations(shape->net, 1) < 100000) return n;
-    return n > few && n <= 2 * few ? few : n > vectors && n <= vectors + few ? vectors : n;
+    size_t part = n > few && n <= 2 * few ? few : n > vectors && n <= vectors + few ? vectors : n;
+    if (part == n || !shape->wide || (size_t)b->kernels.few_points < few || !disti_net_few(shape, b, few)) return n;
+    return part;
 }
 
 /* disti_net_forward of a few points: activations stand (points, max_rows), so that weights fill the vectors. The last
@@ -6902,8 +6915,8 @@ static void disti_sort_places(disti_place *place, int begin, int end, int least)
     }
 }
 
-/* f at n points, in the order of neighbors: blocks of these share dead units. */
-static void disti_groups_eval(void *user, int worker, size_t n, const float *points, float *sdf)
+/* f at n points of a wide net, in the order of neighbors: blocks of these share dead units. */
+static void disti_neighbors_eval(void *user, int worker, size_t n, const float *points, float *sdf)
 {
     const dist_shape *shape = (const dist_shape *)user;
     disti_block b;
@@ -6929,7 +6942,8 @@ static void disti_shape_eval_fn(void *user, int worker, size_t n, const float *p
 {
     const dist_shape *shape = (const dist_shape *)user;
     if (!gradient && disti_wide_floats(shape->ctx, shape->net) > 0) disti_wide_eval(shape, worker, n, points, sdf);
-    else if (!gradient && shape->groups > 1 && n > DISTI_BLOCK) disti_groups_eval(user, worker, n, points, sdf);
+    else if (!gradient && shape->groups && shape->wide && n > DISTI_FEW_POINTS)
+        disti_neighbors_eval(user, worker, n, points, sdf);
     else disti_shape_fused(user, worker, n, points, sdf, gradient, NULL, NULL, NULL);
 }
 
@@ -7316,7 +7330,8 @@ static const double DISTI_PLASTIC[3] = {0.8191725133961645, 0.6710436067037893, 
 
 /* Whether bounds find enough units dead: 0 no; 1 over blocks as close to each other as those of a reverse pass; 2 as a
    picture has them, too. Tried around some of B points. Beside its multiply-adds a bound is taken to cost half of them
-   again, a unit's 256 more and the model of one that is alive 1800: estimates from times with AVX-512. */
+   again, a unit's 256 more and the model of one that is alive 1800: estimates from times with AVX-512. Where bounds
+   leave two thirds or less, pictures gain more than these tell: narrow nets were the faster at 1.03 to 1.08. */
 static int disti_groups_pay(dist_shape *shape, const float *points)
 {
     const int probes = 4;
@@ -7345,7 +7360,7 @@ static int disti_groups_pay(dist_shape *shape, const float *points)
     }
     double all = counter->done - plain.done, share = (some + more) / all;
     shape->many = some < 2.0 / 3.0 * all;
-    return (share < 0.9) + (share < 1.15);
+    return (share < (shape->many ? 1.1 : 0.9)) + (share < 1.15);
 }
 
 /* Sampled |grad f| outside the surface: the 4/5 quantile near it, 31/32 beyond disti_far_from, at least 1. What matters
@@ -7543,6 +7558,7 @@ static dist_status disti_shape_take(dist_shape *shape)
     disti_block b;
     disti_group g;
     shape->groups = disti_net_groups(ctx, net);
+    shape->wide = dist_net_operations(net, 1) >= 100000;
     size_t bytes = disti_block_layout(net, NULL, &b);
     size_t more = shape->groups ? disti_group_layout(net, NULL, &b, &g) : disti_wide_floats(ctx, net) * sizeof(float);
     dist_status status = disti_lanes_reserve(ctx, bytes + more);
@@ -12814,6 +12830,23 @@ static void disti_render_order(disti_render_job *job)
     job->order = tape->order;
 }
 
+/* The index-th tile from the middle of across * down tiles on, ring by ring: what costs most comes first, so that the
+   workers are all done at about the same time. */
+static int disti_tile_outward(int across, int down, int index)
+{
+    int x, y, w = across, h = down, left = across * down - 1 - index; /* counted from outside */
+    for (; w > 2 && h > 2 && left >= 2 * (w + h - 2); w -= 2, h -= 2) left -= 2 * (w + h - 2);
+    if (left < 2 * w) {
+        x = left % w;
+        y = left < w ? 0 : h - 1;
+    } else {
+        left -= 2 * w;
+        x = left & 1 ? w - 1 : 0;
+        y = 1 + left / DISTI_MIN(w, 2);
+    }
+    return (y + (down - h) / 2) * across + x + (across - w) / 2;
+}
+
 static void disti_render_task(void *arg, int index, int worker)
 {
     const disti_render_job *job = (const disti_render_job *)arg;
@@ -12823,6 +12856,7 @@ static void disti_render_task(void *arg, int index, int worker)
     disti_bench_init(tracer->ctx, worker, &bench);
     unsigned long long before = bench.stats->queries;
     if (job->order) index = job->order[index];
+    else if (tracer->ctx->workers > 1) index = disti_tile_outward(job->across, job->count / job->across, index);
     disti_tile_init(job, index, &tile);
     disti_budget budget;
     disti_render_budget(job, &tile, &budget);
@@ -13025,7 +13059,7 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
                tracer.how.trace == DIST_TRACE_GUARDED;
     job.cheap = job.lazy && field->cost > 0.0f && field->cost < 5000.0f;
     job.tile = tracer.how.trace == DIST_TRACE_PAPER ? DISTI_TILE_USUAL / 2 : disti_tile_least(view.width, view.height);
-    int large = (double)view.width * (double)view.height >= 768.0 * 768.0; /* enough of them all the same */
+    int large = (double)view.width * (double)view.height >= 512.0 * 512.0; /* enough of them all the same */
     if (job.tile == DISTI_TILE_USUAL && (field->many || job.cheap || large)) job.tile = DISTI_TILE;
     job.across = (view.width + job.tile - 1) / job.tile;
     int listed = disti_render_list(&tracer, &view, &job);

@@ -2004,6 +2004,29 @@ TEST(depth_of_real_decoders_is_that_of_double)
     dist_context_destroy(ctx);
 }
 
+/* From the middle on, each tile once, whatever the picture's shape. */
+TEST(tiles_go_outward_and_none_is_left_out)
+{
+    for (int across = 1; across <= 9; across++) {
+        for (int down = 1; down <= 9; down++) {
+            char seen[81] = {0};
+            int n = across * down, ring = 99, bad = 0;
+            for (int i = 0; i < n; i++) {
+                int tile = disti_tile_outward(across, down, i), x = tile % across, y = tile / across;
+                if (tile < 0 || tile >= n || seen[tile]++) {
+                    bad++;
+                    continue;
+                }
+                int side = x < across - 1 - x ? x : across - 1 - x, end = y < down - 1 - y ? y : down - 1 - y;
+                int now = side < end ? side : end; /* tiles to the border */
+                bad += now > ring;
+                ring = now;
+            }
+            CHECK(bad == 0);
+        }
+    }
+}
+
 int main(int argc, char **argv)
 {
     test_begin(argc, argv);
@@ -2053,5 +2076,6 @@ int main(int argc, char **argv)
     RUN(error_bounds_hold_for_999_hits_of_1000);
     RUN(error_bounds_hold_for_999_hits_of_1000_of_real_decoders);
     RUN(depth_of_real_decoders_is_that_of_double);
+    RUN(tiles_go_outward_and_none_is_left_out);
     return test_report();
 }

@@ -8812,8 +8812,7 @@ typedef struct disti_ray {
     double base;
     float origin[3], direction[3];
     float enter, leave; /* of the bounding sphere, not before the camera; enter >= leave: it is not met */
-    float footprint;    /* half a pixel's width at unit distance, cos^2 / (2 f)                     (paper,
-    supplement) */
+    float footprint;    /* half a pixel's width at unit distance, cos^2 / (2 f)         (paper, supplement) */
     float cosine;       /* of the angle to the camera's axis: depth = distance * cosine */
     float start, guard; /* where the cones left it, and at most f there (3e38 without cones) */
     float q;            /* where f is wanted next */
@@ -12294,13 +12293,13 @@ static int disti_warm_pass(const disti_warm *warm, disti_ray *ray, float f, floa
     return disti_ray_ask(ray, DISTI_WAIT, ray->s - ray->width);
 }
 
-/* Ray i passes close by a surface or runs into it: from ray->s, f on. With ray->moved it has another end already, which
-   stands if it passes. */
+/* Ray i passes close by a surface or runs into it: from ray->s, f on, first to where spheres of as much room on both
+   sides touch that of f. With ray->moved it has another end already, which stands if it passes. */
 static int disti_warm_approach(disti_warm *warm, int i)
 {
     disti_ray *ray = &warm->bench->rays[i];
     warm->ask[i] = DISTI_ASK_NEAR;
-    ray->width = DISTI_MAX(ray->f, 2e-3f * warm->tracer->field->radius);
+    ray->width = DISTI_MAX(2.0f * ray->f, 2e-3f * warm->tracer->field->radius);
     ray->side = 0;
     ray->steps = 0;
     ray->q = ray->s;
@@ -12681,9 +12680,8 @@ static void disti_render_warm(const disti_render_job *job, int worker, const dis
     disti_warm_owe(&warm);
 }
 
-/* Misses that were traced have no sample where |f| is least,
-    and those that other rays' spheres cover none at all: these
-   get their neighbor's place, and f = 0 says that the least is to be looked for next time. */
+/* Misses that were traced have no sample where |f| is least, and those that other rays' spheres cover none at all:
+   these get their neighbor's place, and f = 0 says that the least is to be looked for next time. */
 static void disti_warm_seed(const disti_tile *tile, const disti_bench *bench)
 {
     int n = tile->width * tile->height;

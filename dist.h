@@ -6686,8 +6686,9 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
     if (d_code) disti_fold_begin(net, &own);
     for (size_t at = 0, count; at < n; at += count, j++) {
         count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK);
-        if (j == blocks && shape->groups > own.values && n - at >= DISTI_GROUP_LEAST) {
-            int part = (int)DISTI_MIN(n - at, (size_t)DISTI_GROUP_POINTS);
+        int part = (int)DISTI_MIN(n - at, (size_t)DISTI_GROUP_POINTS);
+        if (j == blocks && shape->groups > own.values && n - at >= DISTI_GROUP_LEAST &&
+            disti_finite_all(3 * (size_t)part, points + 3 * at)) { /* no bound around a point that is not */
             counter->done += disti_group_forward(shape, &own.kernels, &g, part, points + 3 * at);
             blocks = g.blocks;
             for (j = 0; j < blocks; j++) { /* all, before a reverse pass takes the memory of their inputs */

@@ -566,6 +566,16 @@ TEST(rows_that_are_left_out_change_no_bit)
             CHECK_BYTES((size_t)dist_net_code_size(net) * sizeof(double), d_code[1], d_code[0]);
             CHECK(d_code[0][0] != 0);
         }
+        int worse = 0; /* points that are not finite are no others' business */
+        for (int i = 0; i < MANY; i += 7) points[3 * i + i % 3] = i % 2 ? NAN : INFINITY;
+        shape->groups = 2;
+        field.eval_fn(field.user, 0, MANY, points, sdf[0], NULL);
+        for (int i = 0; i < MANY; i++) {
+            if (i % 7 == 0) continue;
+            field.eval_fn(field.user, 0, 1, points + 3 * i, sdf[1], NULL);
+            worse += memcmp(sdf[1], sdf[0] + i, sizeof(float)) != 0;
+        }
+        CHECK_EQUAL(0, worse);
         CHECK(shape->wide == (from > 0));
         CHECK(done[0] < (from ? 0.8 : 0.95) * done[1]);
         dist_shape_destroy(shape);

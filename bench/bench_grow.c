@@ -164,6 +164,7 @@ static double picture_once(dist_context *ctx, dist_shape *shape, const dist_came
     dist_field field = dist_shape_field(shape);
     dist_render_desc how = how_of(method);
     uint32_t all_alive = shape->all_alive;
+    int groups = shape->groups;
     dist_images out;
     memset(&out, 0, sizeof out);
     memset(stats, 0, sizeof *stats);
@@ -171,11 +172,15 @@ static double picture_once(dist_context *ctx, dist_shape *shape, const dist_came
     out.mask = p->mask;
     out.stats = stats;
     how.epsilon = (float)epsilon;
-    if (method == DENSE) { shape->all_alive = ~(uint32_t)0; }
+    if (method == DENSE) {
+        shape->all_alive = ~(uint32_t)0;
+        shape->groups = 0;
+    }
     double start = seconds_now();
     dist_render(ctx, &field, camera, &how, &out, NULL);
     double seconds = seconds_now() - start;
     shape->all_alive = all_alive;
+    shape->groups = groups;
     check(ctx);
     return seconds;
 }

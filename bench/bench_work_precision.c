@@ -775,13 +775,17 @@ static row picture(const subject *j, const dist_render_desc *how, int dense, int
     size_t n = j->ref->n;
     dist_tape *tape = how->warm_start ? dist_tape_create(j->ctx, j->camera, how) : NULL;
     uint32_t all_alive = j->shape ? j->shape->all_alive : 0;
+    int groups = j->shape ? j->shape->groups : 0;
     check(j->ctx);
     memset(&r, 0, sizeof r);
     memset(&out, 0, sizeof out);
     out.distance = take_floats(n);
     out.mask = (unsigned char *)take(n, 1);
     out.stats = &stats;
-    if (dense && j->shape) { j->shape->all_alive = ~(uint32_t)0; }
+    if (dense && j->shape) {
+        j->shape->all_alive = ~(uint32_t)0;
+        j->shape->groups = 0;
+    }
     time_pictures(j, how, &out, tape, runs, limit, &r);
     out.silhouette = take_floats(n);
     if (tape) { render_once(j, how, &out, tape); } /* the tape knows the silhouette from now on */
@@ -792,7 +796,10 @@ static row picture(const subject *j, const dist_render_desc *how, int dense, int
     out.status = (unsigned char *)take(n, 1);
     render_once(j, how, &out, tape);
     compare(j->ref, &out, (double)stats.epsilon, &r);
-    if (dense && j->shape) { j->shape->all_alive = all_alive; }
+    if (dense && j->shape) {
+        j->shape->all_alive = all_alive;
+        j->shape->groups = groups;
+    }
     gradient(j, how, &r);
     dist_tape_destroy(tape);
     free(out.distance);

@@ -7332,7 +7332,7 @@ static const double DISTI_PLASTIC[3] = {0.8191725133961645, 0.6710436067037893, 
 /* Whether bounds find enough units dead: 0 no; 1 over blocks as close to each other as those of a reverse pass; 2 as a
    picture has them, too. Tried around some of B points. Beside its multiply-adds a bound is taken to cost half of them
    again, a unit's 256 more and the model of one that is alive 1800: estimates from times with AVX-512. Where bounds
-   leave two thirds or less, pictures gain more than these tell: narrow nets were the faster at 1.03 to 1.08. */
+   leave two thirds or less, pictures gain more than these tell (1.1: chosen by bench_step's primitives). */
 static int disti_groups_pay(dist_shape *shape, const float *points)
 {
     const int probes = 4;

@@ -1733,6 +1733,11 @@ typedef struct disti_few {
     int rows, count, out, points;
 } disti_few;
 
+/* Of least to most points, `points` go first by themselves: gemm takes whole vectors of points. */
+typedef struct disti_part {
+    int least, most, points;
+} disti_part;
+
 enum { DISTI_CELL_POINTS = 12, DISTI_CELLS = DISTI_BLOCK / DISTI_CELL_POINTS }; /* neighbors, and their boxes */
 
 /* Of each block, sums over the rows listed, for every output o: sum[0..3][o] = sum_i weights(o, list[i]) model[i][0..3]
@@ -1766,6 +1771,7 @@ typedef struct disti_kernels {
     void (*gemm_some)(const disti_gemm *g, const int *list, int count);
     void (*few)(const disti_few *g);
     int few_points; /* up to so many points `few` is the faster */
+    const disti_part *parts; /* NULL: none; in ascending order up to one whose least is 0 */
     void (*bound)(const disti_bound *g);
     /* top[o] = sum[0][o] + sum[4][o] + bias[o] + slack |bias[o]| + the largest of sum[1..3][o] . c + |sum[1..3][o]| . h
        over DISTI_CELLS boxes (center c, half extents h) */
@@ -2630,12 +2636,12 @@ DISTI_PLAIN(scalar, static)
 
 /* Where a pass ends: no few rows are left to one of their own. */
 #define DISTI_UNTIL(from, count) ((count) - (from) <= DISTI_DEPTH + 16 ? (count) : (from) + DISTI_DEPTH)
-/* All tiles of `total` rows, eight at a time: their strips are R rows high where W vectors wide, else eight. */
+/* All tiles of `total` rows, eight at a time: their strips are R rows high, of one vector eight. */
 #define DISTI_EACH(kernel, isa, first, total, columns, R, W, arguments)                                                \
     for (int c = 0; c < (columns); c += W * DISTI_LANES) {                                                             \
         const int vectors = DISTI_VECTORS((columns) - c);                                                              \
         for (int row = first; row < (total); row += 8) {                                                               \
-            for (int n = row; n < row + 8 && n < (total); n += vectors >= W ? R : 8) {                                 \
+            for (int n = row; n < row + 8 && n < (total); n += vectors >= 2 ? R : 8) {                                 \
                 if (vectors >= W) disti_##kernel##_wide_##isa arguments;                                               \
                 else if (vectors == 2) disti_##kernel##_middle_##isa arguments;                                        \
                 else disti_##kernel##_narrow_##isa arguments;                                                          \
@@ -2779,16 +2785,16 @@ DISTI_PLAIN(scalar, static)
 
 #define DISTI_KERNELS(isa, R, W)                                                                                       \
     DISTI_GEMM_TILE(wide_##isa, R, W, DISTI_SIDE)                                                                      \
-    DISTI_GEMM_TILE(middle_##isa, 8, 2, DISTI_SIDE)                                                                    \
+    DISTI_GEMM_TILE(middle_##isa, R, 2, DISTI_SIDE)                                                                    \
     DISTI_GEMM_TILE(narrow_##isa, 8, 1, DISTI_SIDE)                                                                    \
     DISTI_SOME_TILE(wide_##isa, R, W)                                                                                  \
-    DISTI_SOME_TILE(middle_##isa, 8, 2)                                                                                \
+    DISTI_SOME_TILE(middle_##isa, R, 2)                                                                                \
     DISTI_SOME_TILE(narrow_##isa, 8, 1)                                                                                \
     DISTI_BACK_TILE(wide_##isa, R, W)                                                                                  \
-    DISTI_BACK_TILE(middle_##isa, 8, 2)                                                                                \
+    DISTI_BACK_TILE(middle_##isa, R, 2)                                                                                \
     DISTI_BACK_TILE(narrow_##isa, 8, 1)                                                                                \
     DISTI_WEIGHTS_TILE(wide_##isa, R, W)                                                                               \
-    DISTI_WEIGHTS_TILE(middle_##isa, 8, 2)                                                                             \
+    DISTI_WEIGHTS_TILE(middle_##isa, R, 2)                                                                             \
     DISTI_WEIGHTS_TILE(narrow_##isa, 8, 1)                                                                             \
     DISTI_LAST_LAYER(isa)                                                                                              \
     DISTI_BOUND(isa)                                                                                                   \
@@ -2882,7 +2888,18 @@ DISTI_FUNCTION __m256 disti_keep_avx2(__m256 v, int bits)
 #define DISTI_GREATER(a, b) _mm256_max_ps(a, b)
 #define DISTI_ABS(v) _mm256_andnot_ps(_mm256_set1_ps(-0.0f), v)
 DISTI_KERNELS(avx2, 4, 3)
+DISTI_FEW_TILE(two_avx2, 2, 4)
 DISTI_FEW_TILE(four_avx2, 4, 2)
+DISTI_FEW_TILE(six_avx2, 6, 2)
+DISTI_FEW_TILE(eight_avx2, 8, 1)
+static void disti_few_avx2(const disti_few *g)
+{
+    if (g->points <= 2) disti_few_two_avx2(g);
+    else if (g->points <= 4) disti_few_four_avx2(g);
+    else if (g->points <= 6) disti_few_six_avx2(g);
+    else disti_few_eight_avx2(g);
+}
+static const disti_part disti_parts_avx2[] = {{9, 18, 6}, {25, 30, 24}, {33, 40, 24}, {0, 0, 0}};
 #undef DISTI_ABS
 #undef DISTI_GREATER
 #undef DISTI_TWO
@@ -2956,6 +2973,7 @@ static void disti_few_avx512(const disti_few *g)
     else if (g->points <= 10) disti_few_ten_avx512(g);
     else disti_few_twelve_avx512(g);
 }
+static const disti_part disti_parts_avx512[] = {{13, 24, 12}, {33, 44, 32}, {0, 0, 0}};
 #undef DISTI_ABS
 #undef DISTI_GREATER
 #undef DISTI_TWO
@@ -3299,16 +3317,26 @@ static disti_kernels disti_kernels_for(int isa)
     disti_kernels kernels;
     DISTI_TABLE(scalar)
     kernels.few = disti_few_scalar;
-    kernels.few_points = DISTI_FEW_POINTS;
+    kernels.few_points = isa == DIST_ISA_SCALAR ? DISTI_FEW_POINTS : 4;
+    kernels.parts = NULL;
 #ifdef DISTI_X86
     if (isa == DIST_ISA_SSE2) { DISTI_TABLE(sse2) kernels.few = disti_few_four_sse2; }
-    if (isa == DIST_ISA_AVX2) { DISTI_TABLE(avx2) kernels.few = disti_few_four_avx2; }
-    if (isa == DIST_ISA_AVX512) { DISTI_TABLE(avx512) kernels.few = disti_few_avx512; }
+    if (isa == DIST_ISA_AVX2) {
+        DISTI_TABLE(avx2)
+        kernels.few = disti_few_avx2;
+        kernels.few_points = 8;
+        kernels.parts = disti_parts_avx2;
+    }
+    if (isa == DIST_ISA_AVX512) {
+        DISTI_TABLE(avx512)
+        kernels.few = disti_few_avx512;
+        kernels.few_points = DISTI_FEW_POINTS;
+        kernels.parts = disti_parts_avx512;
+    }
 #endif
 #ifdef DISTI_NEON
     if (isa == DIST_ISA_NEON) { DISTI_TABLE(neon) kernels.few = disti_few_four_neon; }
 #endif
-    if (isa > DIST_ISA_SCALAR && isa != DIST_ISA_AVX512) kernels.few_points = 4;
     return kernels;
 }
 
@@ -6383,14 +6411,14 @@ static int disti_net_few(const dist_shape *shape, const disti_block *b, size_t n
            net->layers > 1 && !shape->ctx->blas.sgemm_fn;
 }
 
-/* How many of up to a block's points are evaluated next. The other kernels take whole vectors of points, so some counts
-   go faster as two parts, one of them of few points, where a layer is long enough to pay for a second pass over it. */
+/* How many of up to a block's points are evaluated next: some counts go faster as parts, one of them of few points, where
+   a layer is long enough to pay for a second pass over it. */
 static size_t disti_net_part(const dist_shape *shape, const disti_block *b, size_t n)
 {
-    const size_t few = DISTI_FEW_POINTS, vectors = 2 * 16;
-    size_t part = n > few && n <= 2 * few ? few : n > vectors && n <= vectors + few ? vectors : n;
-    if (part == n || !shape->wide || (size_t)b->kernels.few_points < few || !disti_net_few(shape, b, few)) return n;
-    return part;
+    const disti_part *part = b->kernels.parts;
+    if (!part || !shape->wide || !disti_net_few(shape, b, (size_t)b->kernels.few_points)) return n;
+    while (part->least && n > (size_t)part->most) part++;
+    return part->least && n >= (size_t)part->least ? (size_t)part->points : n;
 }
 
 /* disti_net_forward of a few points: activations stand (points, max_rows), so that weights fill the vectors. The last

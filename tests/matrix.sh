@@ -102,10 +102,11 @@ if [ -n "$quick" ]; then
     # What does not optimize is slow: there the parts that depend on the compiler, inline functions and scratch.
     row O0 build/matrix/O0 $cc "-O0" "" 1 "" test_kernels test_half test_net test_context test_render test_workspace
     # What depends on the instruction set, and on the order of sums.
-    set -- test_kernels test_half test_net test_color test_second test_weights test_render test_trace test_stability
-    row fast_math build/matrix/fast_math $cc "-O2 -ffast-math" "" 1 "" "$@" test_gradients test_scene test_camera
-    isa_row scalar build $cc "-O2" scalar 1 "$@"
-    isa_row avx2 build $cc "-O2" avx2 1 "$@" test_gradients test_warm
+    set -- test_kernels test_half test_net test_color test_second test_weights test_render test_stability
+    row fast_math build/matrix/fast_math $cc "-O2 -ffast-math" "" 1 "" "$@" test_trace test_gradients test_scene \
+        test_camera
+    isa_row scalar build $cc "-O2" scalar 1 "$@" # test_trace takes minutes there
+    isa_row avx2 build $cc "-O2" avx2 1 "$@" test_trace test_gradients test_warm
 else
     for cc in gcc clang; do
         if ! have $cc; then

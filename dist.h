@@ -9502,7 +9502,7 @@ static float disti_newton_error(const disti_tracer *tracer, float epsilon, float
 /* A sample where the neighbors' hits and slopes predicted this ray's: Newton's steps, the first by their slope, as long
    as these are alike (it is off by about its length times 3 % and half of what they differ), the others, and any for a
    sample that came with its gradient, by its own. A step too long to trust, or f that does not shrink, sends the ray
-   back to its front. */
+   back to its front. At a grazing angle only a sample behind the surface shows that the ray does not pass it by. */
 static int disti_ray_predicted(const disti_tracer *tracer, disti_ray *ray, float f)
 {
     float epsilon = disti_ray_epsilon(tracer, ray, ray->q);
@@ -9512,9 +9512,13 @@ static int disti_ray_predicted(const disti_tracer *tracer, disti_ray *ray, float
     float magnitude = f < 0.0f ? -f : f, before = ray->fa < 0.0f ? -ray->fa : ray->fa;
     int far = 2.0f * (float)(ray->base + (double)ray->q) * ray->footprint > 0.01f * tracer->field->radius;
     if (first && fronted && f > 0.0f) before = 0.5f * ray->f; /* the front's: it fell, or it ends elsewhere */
-    int good = slope < -0.12f * tracer->lipschitz && length < 0.03f * tracer->field->radius && magnitude < before &&
+    int good = slope < -0.05f * tracer->lipschitz && length < 0.03f * tracer->field->radius && magnitude < before &&
                ray->side < 5;
     int ends = f < epsilon || slope < -0.3f * tracer->lipschitz; /* else f may flatten out before it is 0 */
+    if (f > 0.0f && slope > -0.12f * tracer->lipschitz) { /* as it does beside an outline */
+        ends = 0;
+        step *= 1.2f;
+    }
     float most = foreign ? ray->width : far ? 1.0f : 12.0f;
     if (good && ends && (!foreign || ray->width > 0.0f) && length <= most * epsilon) {
         float off = ray->q + step - ray->target;
@@ -10870,7 +10874,7 @@ static int disti_predict(const disti_tracer *tracer, const disti_tile *tile, con
         ray->incline = guess.quality > 0 ? guess.slope : 0.0f;
         return 1;
     }
-    if (guess.quality == 0 || !(guess.slope < -0.12f * tracer->lipschitz)) return 1;
+    if (guess.quality == 0 || !(guess.slope < -0.05f * tracer->lipschitz)) return 1;
     float s = (float)((double)(guess.depth / ray->cosine) - ray->base);
     float epsilon = disti_ray_epsilon(tracer, ray, s);
     if (!(s > ray->start && s < ray->leave)) return 1;
@@ -10878,8 +10882,9 @@ static int disti_predict(const disti_tracer *tracer, const disti_tile *tile, con
     ray->target = s;
     ray->incline = guess.slope;
     int near = tile->lattice == DISTI_LATTICE; /* neighbors far from each other say where, but not how steeply */
-    if (near && guess.quality >= 2 && guess.slope < -0.3f * tracer->lipschitz) /* else 0: a second query makes sure */
-        ray->width = DISTI_MAX(4.0f, 0.35f / (0.03f + 0.5f * guess.spread));
+    if (near && guess.quality >= 2 && guess.slope < -0.12f * tracer->lipschitz) /* else 0: a second query makes sure */
+        ray->width = guess.slope < -0.3f * tracer->lipschitz ? DISTI_MAX(4.0f, 0.35f / (0.03f + 0.5f * guess.spread))
+                                                            : 1.0f;
     ray->s = ray->start;
     if (guess.quality > 0 && disti_ray_aims(tracer, ray, ray->guard - 1e-3f * tracer->field->radius)) {
         int alike = guess.off <= 0.5f * epsilon || (guess.off <= 2.0f * epsilon && guess.differ <= 0.5f * epsilon);

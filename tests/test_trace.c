@@ -228,6 +228,28 @@ TEST(no_thin_plate_is_missed_by_large_pictures)
     dist_context_destroy(ctx);
 }
 
+/* A face that rays meet at slopes of .06 to .12 is foretold by neighbors like any other. */
+TEST(faces_at_a_grazing_angle_take_one_query_a_pixel_or_so)
+{
+    dist_context *ctx = shape_context();
+    const float eye[3] = {0.3f, 0.24f, 2.2f}, at[3] = {0, 0.05f, 0}, up[3] = {0, 1, 0};
+    test_shape shape = shape_make(SHAPE_BOX, 0.6, 0.05, 0.6, 0);
+    dist_field field = shape_field(&shape, 1, 1);
+    dist_camera camera = dist_camera_look_at(WIDE, WIDE, 0.62f, eye, at, up);
+    CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, NULL, &picture_a), ctx);
+    verdict v = judge(&shape, &camera, 1, 1, 1e-5, &picture_a);
+    const dist_stats *s = &picture_a.stats;
+    CHECK_EQUAL(0, v.missed);
+    CHECK_EQUAL(0, v.spent);
+    CHECK_EQUAL(0, v.phantom);
+    CHECK(v.broken * 1000 <= v.judged && v.crossing > WIDE * WIDE / 20);
+    int good = CHECK(10 * (s->march_queries + s->refine_queries) < 13 * s->hits);
+    if (!good || test_state.verbose)
+        printf("    crossing %d, broken %d of %d, worst %.1e; %llu hits, %llu cone, %llu march, %llu refine queries\n",
+               v.crossing, v.broken, v.judged, v.worst, s->hits, s->cone_queries, s->march_queries, s->refine_queries);
+    dist_context_destroy(ctx);
+}
+
 TEST(no_plate_is_missed_silently_at_any_angle)
 {
     dist_context *ctx = shape_context();
@@ -2033,6 +2055,7 @@ int main(int argc, char **argv)
     RUN(every_crossing_is_hit_and_999_of_1000_within_the_error_bound);
     RUN(no_plate_however_thin_is_missed);
     RUN(no_thin_plate_is_missed_by_large_pictures);
+    RUN(faces_at_a_grazing_angle_take_one_query_a_pixel_or_so);
     RUN(no_plate_is_missed_silently_at_any_angle);
     RUN(no_rod_thinner_than_a_pixel_is_missed);
     RUN(one_pixel_in_5000_of_a_rod_is_missed_by_large_pictures_and_none_certified);

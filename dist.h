@@ -10874,7 +10874,7 @@ static int disti_predict(const disti_tracer *tracer, const disti_tile *tile, con
         ray->incline = guess.quality > 0 ? guess.slope : 0.0f;
         return 1;
     }
-    if (guess.quality == 0 || !(guess.slope < -0.05f * tracer->lipschitz)) return 1;
+    if (guess.quality == 0 || !(guess.slope < -0.05f * tracer->lipschitz)) return 1; /* as in disti_ray_predicted */
     float s = (float)((double)(guess.depth / ray->cosine) - ray->base);
     float epsilon = disti_ray_epsilon(tracer, ray, s);
     if (!(s > ray->start && s < ray->leave)) return 1;
@@ -10884,7 +10884,7 @@ static int disti_predict(const disti_tracer *tracer, const disti_tile *tile, con
     int near = tile->lattice == DISTI_LATTICE; /* neighbors far from each other say where, but not how steeply */
     if (near && guess.quality >= 2 && guess.slope < -0.12f * tracer->lipschitz) /* else 0: a second query makes sure */
         ray->width = guess.slope < -0.3f * tracer->lipschitz ? DISTI_MAX(4.0f, 0.35f / (0.03f + 0.5f * guess.spread))
-                                                            : 1.0f;
+                                                             : 1.0f;
     ray->s = ray->start;
     if (guess.quality > 0 && disti_ray_aims(tracer, ray, ray->guard - 1e-3f * tracer->field->radius)) {
         int alike = guess.off <= 0.5f * epsilon || (guess.off <= 2.0f * epsilon && guess.differ <= 0.5f * epsilon);

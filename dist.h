@@ -232,6 +232,10 @@ typedef struct dist_field {
     int color_code_size;       /* length of d_color_code */
     size_t color_weight_count; /* of a color net of its own; 0: the weights of color, if any, are among weight_count */
     dist_context *owner; /* the context that made it; NULL: any */
+    /* counts the changes of what user points to, so that a cache of what it was is refused. Set by dist_shape_field and
+       dist_scene_field; NULL: that is not looked at */
+    unsigned (*changes_fn)(const void *user);
+    const struct dist_cache *cache; /* set by dist_cache_field; NULL: none */
 } dist_field;
 
 /* f = distance to a sphere, to a torus around the y axis, to an axis-aligned box (half extents), exact; each within its
@@ -576,6 +580,25 @@ DIST_API dist_status dist_field_closest_point(dist_context *ctx, const dist_fiel
                                               const float *points, float *closest, float *distance,
                                               unsigned char *status);
 
+/* What is empty of a field's bounding sphere, in a grid, for what stands still and is asked often. The rays of
+   dist_trace pass what it shows to be empty without a query, and find what they find without it to within the error
+   bounds, but for rays that just touch the surface; a sphere of dist_field_collide that is clear of it by a cell or two
+   asks nothing. Empty is what the field's Lipschitz figures allow no surface in, as for a picture's cones; pictures,
+   whose rays help each other, do without. bench/bench_cache.c prints what it saves: half to three quarters of the rays'
+   queries. Belongs to the context that made it. */
+typedef struct dist_cache dist_cache;
+/* resolution: cells along each side of the cube around the bounding sphere, a multiple of 8 to 512; 0: 64. That many
+   bytes to the third power, and about 8 times its square of queries. NULL on failure. */
+DIST_API dist_cache *dist_cache_create(dist_context *ctx, const dist_field *field, int resolution);
+DIST_API void dist_cache_destroy(dist_cache *cache);
+/* The field with its cache, to be traced instead of it. Borrows both. As soon as the shape's code, the net's weights or
+   the scene have changed every call refuses it; a field of your own without changes_fn must not change. */
+DIST_API dist_field dist_cache_field(const dist_cache *cache);
+/* Makes it anew for a field that has changed, or another one; then take dist_cache_field again. No allocator call. */
+DIST_API dist_status dist_cache_update(dist_cache *cache, const dist_field *field);
+/* What it took to make it. */
+DIST_API unsigned long long dist_cache_queries(const dist_cache *cache);
+
 /* A sphere against a field. */
 typedef struct dist_contact {
     float depth;     /* how far the sphere is in; below 0: they are at least so far apart */
@@ -810,6 +833,7 @@ typedef struct dist_workspace_desc {
     const dist_camera *camera; /* dist_tape_create for it and how. The size of a picture without a tape, its planes and
                                   what of it is wanted cost no memory */
     const dist_render_desc *how;
+    int cache;     /* dist_cache_create with this resolution; 0: none */
 } dist_workspace_desc;
 /* The bytes that an arena needs which hands out one piece after another, from an address that is a multiple of 64 and
    each rounded up to one, and takes nothing back: exactly; with one less some create function fails with
@@ -3717,6 +3741,42 @@ DISTI_ANALYTIC(box, 6, disti_length(c[3], c[4], c[5]))
 #define DISTI_RADIUS_MOST 1e15f
 
 /* What makes a field unusable, for every function that takes one. */
+/* See 07 trace. at: for each cell by how far the center is from the surface at least, in units, rounded down; 0: not
+   known to be outside. */
+struct dist_cache {
+    dist_context *ctx;
+    dist_field field; /* without a cache */
+    unsigned changes;
+    int resolution;
+    float corner[3], cell, inverse, unit;    /* lowest corner of the cube; a cell's side, and 1 / that; cell / 4 */
+    float lipschitz, lipschitz_far;          /* what it was made with */
+    unsigned char *at;                       /* (resolution, resolution, resolution), x fastest */
+    unsigned long long queries;
+};
+
+static unsigned disti_changes(const dist_field *field)
+{
+    return field->changes_fn ? field->changes_fn(field->user) : 0;
+}
+
+/* Whether what the cache shows to be empty is so for this field, with these figures. */
+static dist_status disti_cache_check(dist_context *ctx, const dist_field *field, float lipschitz, float lipschitz_far,
+                                     const char *function)
+{
+    const dist_cache *cache = field->cache;
+    const dist_field *own = &cache->field;
+    int same = field->user == own->user && field->eval_fn == own->eval_fn && field->radius == own->radius &&
+               memcmp(field->center, own->center, sizeof field->center) == 0 && field->clamp == own->clamp;
+    if (!same || disti_changes(field) != cache->changes)
+        return disti_refuse(ctx, "%s: field.cache was made of another field, or that has changed since; see "
+                                 "dist_cache_update", function);
+    if (lipschitz > cache->lipschitz || lipschitz_far > cache->lipschitz_far)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: the Lipschitz figure is %d, but field.cache was made with %d; "
+                                                  "see dist_cache_update", function, (double)lipschitz,
+                          (double)cache->lipschitz);
+    return DIST_OK;
+}
+
 static dist_status disti_field_check(dist_context *ctx, const dist_field *field, const char *function)
 {
     if (!field) return disti_refuse(ctx, "%s: field is NULL", function);
@@ -3740,7 +3800,10 @@ static dist_status disti_field_check(dist_context *ctx, const dist_field *field,
     dist_status status = disti_limits(ctx, function, sizeof limits / sizeof limits[0], limits);
     if (status != DIST_OK) return status;
     if (field->owner && field->owner != ctx) return disti_refuse(ctx, "%s: field belongs to another context", function);
-    return DIST_OK;
+    if (!field->cache) return DIST_OK;
+    float lipschitz = field->lipschitz > 0.0f ? field->lipschitz : 1.0f;
+    return disti_cache_check(ctx, field, lipschitz, field->lipschitz_far > 0.0f ? field->lipschitz_far : lipschitz,
+                             function);
 }
 
 enum { DISTI_CHUNK = DISTI_SLOTS * 4 * DISTI_BLOCK }; /* points of a backward pass held at once */
@@ -4227,6 +4290,7 @@ struct dist_scene {
     disti_ball *ball;
     unsigned char *scratch; /* ctx->workers times scratch_bytes */
     size_t scratch_bytes, code_size, color_code_size;
+    unsigned changes; /* of the placements and fields, so far */
 };
 
 enum { DISTI_SCENE_CHUNK = 2048, DISTI_SCENE_PIECE = DISTI_BLOCK, DISTI_CONTESTED = -2 };
@@ -4708,6 +4772,7 @@ static dist_status disti_scene_place(dist_scene *scene, int k, const dist_instan
             return disti_fail(ctx, DIST_BAD_ARGUMENT,
                               "%s: placement.translation puts the bounding sphere's center at %d on axis %d; must be "
                               "within 1e15 of 0", function, (double)ball.center[i], (double)i);
+    scene->changes += 1 + disti_changes(&placed->field); /* so that the sum over all never falls */
     *placed = next;
     scene->ball[k] = ball;
     return DIST_OK;
@@ -4809,6 +4874,14 @@ static float disti_scene_bound(const dist_scene *scene, float center[3])
     return (float)(scene->count > 1 ? least * (1.0 + 1e-6) : least);
 }
 
+static unsigned disti_scene_changes(const void *user)
+{
+    const dist_scene *scene = (const dist_scene *)user;
+    unsigned changes = scene->changes;
+    for (int k = 0; k < scene->count; k++) changes += disti_changes(&scene->placed[k].field);
+    return changes;
+}
+
 DIST_API dist_field dist_scene_field(dist_scene *scene)
 {
     dist_field field;
@@ -4816,6 +4889,7 @@ DIST_API dist_field dist_scene_field(dist_scene *scene)
     if (!scene) return field;
     field.user = scene;
     field.owner = scene->ctx;
+    field.changes_fn = disti_scene_changes;
     field.eval_fn = disti_scene_eval;
     field.fused_fn = disti_scene_fused;
     field.color_fn = disti_scene_color;
@@ -5747,6 +5821,7 @@ struct dist_net {
     int *unit_order; /* (layers, max_rows): the file's units as they stand in the kernels; NULL: as in the file */
     float *half_panels; /* 32 bits each: two 16-bit weights; NULL: none */
     int half;           /* DIST_HALF_F16 or BF16, or 0 */
+    unsigned changes;   /* of the weights, so far */
     size_t param_count, panel_count, half_count;
     char channel_names[DISTI_MAX_CHANNELS][8];
 };
@@ -5759,6 +5834,7 @@ struct dist_shape {
     float lipschitz, lipschitz_far;
     float half_error; /* largest of 16 bits at the samples of disti_shape_slope */
     int half;         /* what the net had then */
+    unsigned changes; /* of the code, so far */
     int groups;       /* disti_groups_pay */
     int wide;         /* its net's queries cost enough for one more look at a batch's points to pay */
     int many;         /* dist_field.many: two thirds or less of a block's multiply-adds are left with bounds */
@@ -7457,6 +7533,12 @@ static void disti_shape_slope(dist_shape *shape, const dist_field *field)
     disti_float_state_leave(state);
 }
 
+static unsigned disti_shape_changes(const void *user)
+{
+    const dist_shape *shape = (const dist_shape *)user;
+    return shape->changes + shape->net->changes;
+}
+
 DIST_API dist_field dist_shape_field(dist_shape *shape)
 {
     dist_field field;
@@ -7465,6 +7547,7 @@ DIST_API dist_field dist_shape_field(dist_shape *shape)
     const dist_net *net = shape->net;
     field.user = shape;
     field.owner = shape->ctx;
+    field.changes_fn = disti_shape_changes;
     if (net->sdf_channel >= 0) {
         field.eval_fn = disti_shape_eval_fn;
         field.fused_fn = disti_shape_fused;
@@ -7544,6 +7627,7 @@ static dist_status disti_shape_set_code(dist_shape *shape, const float *code, co
     dist_status status = disti_code_copy(shape->ctx, function, size, code, shape->code);
     if (status != DIST_OK) return status;
     disti_shape_fold(shape);
+    shape->changes++;
     if (!shape->texture) return DIST_OK;
     memcpy(shape->texture->code, shape->code, size * sizeof(float));
     disti_shape_fold(shape->texture);
@@ -8616,6 +8700,7 @@ DIST_API dist_status dist_net_set_weights(dist_context *ctx, dist_net *net, cons
                               (double)i, (double)weights[i]);
     memcpy(net->params, weights, net->param_count * sizeof(float));
     disti_net_pack(net);
+    net->changes++;
     return DIST_OK;
 }
 
@@ -8889,6 +8974,8 @@ typedef struct disti_tracer {
     float lipschitz, epsilon, noise;
     float detail;     /* the field's, or its radius */
     float far, ratio; /* from |f| = far on the slope is at most lipschitz / ratio */
+    const dist_cache *cache; /* that rays are to use; NULL: none */
+    float shy;               /* by how much less than it says a ball of it is trusted: to where |f| is epsilon */
 } disti_tracer;
 
 static int disti_is_coarse(const dist_field *field) { return field->coarse_fn && field->eval_fn == field->coarse_fn; }
@@ -8979,7 +9066,10 @@ static dist_status disti_tracer_init(disti_tracer *tracer, dist_context *ctx, co
     if (field->clamp > 0.0f && tracer->how.trace == DIST_TRACE_GUARDED)
         tracer->epsilon = DISTI_MIN(tracer->epsilon, 0.5f * field->clamp); /* a clamped f is near nothing */
     tracer->epsilon = DISTI_MAX(tracer->epsilon, tracer->how.epsilon > 0.0f ? tracer->noise : 0.0f);
-    return DIST_OK;
+    tracer->cache = NULL;
+    tracer->shy = DISTI_MAX(tracer->epsilon, 5e-5f * tracer->detail) / tracer->lipschitz;
+    if (!field->cache || !(tracer->how.lipschitz > 0.0f)) return DIST_OK;
+    return disti_cache_check(ctx, field, tracer->lipschitz, tracer->lipschitz, function);
 }
 
 /* Radius of the sphere around a point with this |f| in which the Lipschitz figures allow no surface. */
@@ -9948,13 +10038,57 @@ static float disti_covered(const disti_bench *bench, int index, const disti_ray 
     return cover->end;
 }
 
+/* Radius of a cache's ball, which holds no surface, about the center of the cell that p is in; d: p, from there. */
+DISTI_INLINE float disti_cache_ball(const dist_cache *cache, const float p[3], float d[3])
+{
+    size_t at = 0;
+    float last = (float)(cache->resolution - 1);
+    for (int i = 2; i >= 0; i--) {
+        float cell = (p[i] - cache->corner[i]) * cache->inverse;
+        cell = DISTI_MIN(DISTI_MAX(cell, 0.0f), last);
+        at = at * (size_t)cache->resolution + (size_t)cell;
+        d[i] = p[i] - cache->corner[i] - ((float)(int)cell + 0.5f) * cache->cell;
+    }
+    return (float)cache->at[at] * cache->unit;
+}
+
+/* No surface is nearer to p than this. */
+static float disti_cache_clear(const dist_cache *cache, const float p[3])
+{
+    float d[3], radius = disti_cache_ball(cache, p, d);
+    return DISTI_MAX(radius - disti_length(d[0], d[1], d[2]), 0.0f);
+}
+
+/* How far a ray may go for balls that follow one another from `from` on: to there where none holds that, else to s. */
+static float disti_cache_walk(const disti_tracer *tracer, const disti_ray *ray, float s, float from)
+{
+    const dist_cache *cache = tracer->cache;
+    float least = 0.05f * cache->cell, end = DISTI_MAX(s, from);
+    while (end < ray->leave) {
+        float p[3], d[3], along = 0.0f, square = 0.0f;
+        disti_ray_point(ray, end, p);
+        float radius = disti_cache_ball(cache, p, d) - tracer->shy;
+        for (int i = 0; i < 3; i++) {
+            along += d[i] * ray->direction[i];
+            square += d[i] * d[i];
+        }
+        if (!(radius > 0.0f) || square >= radius * radius) break;
+        float step = sqrtf(along * along - square + radius * radius) - along;
+        if (step < least) break;
+        s = end += step;
+    }
+    return s;
+}
+
 /* Moves a ray that is about to step past what is known to be empty. 0: it is through. */
-static int disti_skip(const disti_bench *bench, int index, disti_ray *ray)
+static int disti_skip(const disti_tracer *tracer, const disti_bench *bench, int index, disti_ray *ray)
 {
     if (ray->mode != DISTI_FIRST && ray->mode != DISTI_MARCH && ray->mode != DISTI_SKIP) return 1;
     int begins = ray->mode == DISTI_FIRST;
     if (begins && ray->fb > 0.0f) return 1; /* it has been there */
-    float s = disti_covered(bench, index, ray, begins ? ray->q : ray->s);
+    float s = begins ? ray->q : ray->s;
+    if (bench->balls) s = disti_covered(bench, index, ray, s);
+    if (tracer->cache) s = disti_cache_walk(tracer, ray, s, begins ? s : ray->s + disti_empty(tracer, ray->f));
     if (s >= ray->leave) return disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest * ray->sign, 0.0f);
     if (s <= ray->q) return 1;
     ray->q = s;
@@ -10016,11 +10150,12 @@ static void disti_bench_swap(const disti_bench *bench, size_t i, size_t j)
 static size_t disti_trace_rounds(const disti_tracer *tracer, int worker, const disti_bench *bench, size_t active,
                                  size_t enough)
 {
+    int skips = bench->balls || tracer->cache;
     while (active > enough) {
         size_t kept = 0, sloped = 0;
         for (size_t i = 0; i < active; i++) {
             disti_ray *ray = &bench->rays[bench->index[i]];
-            if (bench->balls && !disti_skip(bench, bench->index[i], ray)) continue;
+            if (skips && !disti_skip(tracer, bench, bench->index[i], ray)) continue;
             disti_ray_point(ray, ray->q, bench->points + 3 * kept);
             bench->index[kept] = bench->index[i];
             ray->own = bench->gradient && ray->mode == DISTI_PREDICT;
@@ -10226,6 +10361,7 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
     if (tracer.how.trace != DIST_TRACE_GUARDED || tracer.how.warm_start)
         return disti_refuse(ctx, "dist_trace: how.%s is for pictures, must be 0",
                             tracer.how.warm_start ? "warm_start" : "trace DIST_TRACE_PAPER");
+    tracer.cache = field->cache;
     disti_stats_begin(ctx);
     disti_free_job job = {&tracer, n, origins, directions, hits};
     disti_run(ctx, (int)((n + DISTI_FREE_RAYS - 1) / DISTI_FREE_RAYS), disti_free_task, &job);
@@ -10233,10 +10369,182 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
     return DIST_OK;
 }
 
-/* Nearest points and contacts. From x on the surface a share of the way back to p and down to the surface again,
-   x' = P(x + share (p - x)): stays where x is nearest, in creases too, and cannot overshoot where the surface bends
-   away; P, steps of Newton along the gradient, is where it is a distance's own foot. Half the share where that came no
-   nearer. */
+/* A cache: a grid over the bounding sphere's cube of balls about the cells' centers that hold no surface, by f there,
+   as far as it is positive: of radius E(f) = disti_empty. (Where the center lies outside the bounding sphere f is asked
+   for on that, at a distance o: E(f) - o.) Bricks of 8 cells a side fall into eight, down to cells, unless the ball
+   about their middle holds 1.25 of them, more than all, as balls are rounded down by up to a quarter of a cell; then
+   each cell gets E less the way to its center. So it takes a query for each cell that the surface is near, and few
+   elsewhere. */
+enum { DISTI_BRICK = 8, DISTI_BRICKS = 8, DISTI_BRICK_CELLS = DISTI_BRICK * DISTI_BRICK * DISTI_BRICK };
+
+typedef struct disti_cell {
+    unsigned short x, y, z;
+    float away; /* of where it is asked from its center */
+} disti_cell;
+
+/* A ball of this radius about the middle of `size` cells a side. */
+static void disti_cache_fill(const dist_cache *cache, const disti_cell *cell, int size, float radius)
+{
+    size_t n = (size_t)cache->resolution;
+    for (int i = 0, count = size * size * size; i < count; i++) {
+        int x = i % size, y = i / size % size, z = i / size / size;
+        float half = 0.5f * (float)(size - 1), way = disti_length((float)x - half, (float)y - half, (float)z - half);
+        float units = (radius - way * cache->cell) / cache->unit;
+        size_t at = (((size_t)cell->z + (size_t)z) * n + cell->y + (size_t)y) * n + cell->x + (size_t)x;
+        cache->at[at] = (unsigned char)(units > 0.0f ? DISTI_MIN(units, 255.0f) : 0.0f);
+    }
+}
+
+typedef struct disti_cache_job {
+    dist_cache *cache;
+    const disti_tracer *tracer;
+} disti_cache_job;
+
+/* Eight bricks, in a row along x. */
+static void disti_cache_task(void *arg, int index, int worker)
+{
+    const disti_cache_job *job = (const disti_cache_job *)arg;
+    const dist_cache *cache = job->cache;
+    const dist_field *field = &cache->field;
+    disti_bench bench;
+    disti_bench_init(cache->ctx, worker, &bench);
+    disti_cell *cell = (disti_cell *)(void *)bench.rest, *next = cell + DISTI_BRICKS * DISTI_BRICK_CELLS;
+    int side = cache->resolution / DISTI_BRICK, rows = (side + DISTI_BRICKS - 1) / DISTI_BRICKS, count = 0;
+    int x = index % rows * DISTI_BRICKS, y = index / rows % side, z = index / rows / side;
+    DIST_ASSERT(2 * DISTI_BRICKS * DISTI_BRICK_CELLS * sizeof(disti_cell) <= DISTI_REST_BYTES);
+    for (; x < side && count < DISTI_BRICKS; x++, count++) {
+        cell[count].x = (unsigned short)(x * DISTI_BRICK);
+        cell[count].y = (unsigned short)(y * DISTI_BRICK);
+        cell[count].z = (unsigned short)(z * DISTI_BRICK);
+    }
+    for (int size = DISTI_BRICK; count > 0; size /= 2) {
+        float half = 0.5f * (float)size, corner = 1.7320509f * half * cache->cell;
+        size_t asked = 0, opened = 0;
+        for (int i = 0; i < count; i++) {
+            const float at[3] = {(float)cell[i].x, (float)cell[i].y, (float)cell[i].z};
+            float *p = bench.points + 3 * asked, d[3];
+            for (int k = 0; k < 3; k++) p[k] = cache->corner[k] + (at[k] + half) * cache->cell;
+            for (int k = 0; k < 3; k++) d[k] = p[k] - field->center[k];
+            float length = disti_length(d[0], d[1], d[2]), away = DISTI_MAX(length - field->radius, 0.0f);
+            if (away > corner) { /* no ray comes there */
+                disti_cache_fill(cache, &cell[i], size, 0.0f);
+                continue;
+            }
+            for (int k = 0; k < 3 && away > 0.0f; k++) p[k] = field->center[k] + d[k] * (field->radius / length);
+            cell[asked] = cell[i];
+            cell[asked++].away = away;
+        }
+        asked = disti_query(job->tracer, worker, &bench, asked);
+        for (size_t i = 0; i < asked; i++) {
+            float f = bench.sdf[i], radius = disti_finite(f) ? disti_empty(job->tracer, f) : 0.0f;
+            radius += f > 0.0f ? -cell[i].away : cell[i].away;
+            if (size == 1 || radius > 1.25f * corner || radius < -corner) {
+                disti_cache_fill(cache, &cell[i], size, radius);
+                continue;
+            }
+            for (int k = 0; k < 8; k++) {
+                disti_cell *part = &next[opened++];
+                *part = cell[i];
+                part->x = (unsigned short)(part->x + (k & 1 ? size / 2 : 0));
+                part->y = (unsigned short)(part->y + (k & 2 ? size / 2 : 0));
+                part->z = (unsigned short)(part->z + (k & 4 ? size / 2 : 0));
+            }
+        }
+        disti_cell *done = cell;
+        cell = next;
+        next = done;
+        count = (int)opened;
+    }
+}
+
+static dist_status disti_cache_make(dist_cache *cache, const dist_field *field, const char *function)
+{
+    disti_tracer tracer;
+    dist_stats stats;
+    dist_context *ctx = cache->ctx;
+    dist_field own;
+    memset(&own, 0, sizeof own);
+    if (field) own = *field;
+    own.cache = NULL; /* maybe this one, of what the field was before */
+    dist_status status = disti_field_check(ctx, field ? &own : NULL, function);
+    if (status == DIST_OK) status = disti_tracer_init(&tracer, ctx, &own, NULL, function);
+    if (status != DIST_OK) return status;
+    cache->field = own;
+    cache->changes = disti_changes(&own);
+    cache->cell = 2.0f * own.radius / (float)cache->resolution;
+    cache->inverse = 1.0f / cache->cell;
+    cache->unit = 0.25f * cache->cell;
+    cache->lipschitz = tracer.lipschitz;
+    cache->lipschitz_far = tracer.lipschitz / tracer.ratio;
+    for (int i = 0; i < 3; i++) cache->corner[i] = own.center[i] - own.radius;
+    disti_stats_begin(ctx);
+    disti_cache_job job = {cache, &tracer};
+    int side = cache->resolution / DISTI_BRICK;
+    disti_run(ctx, side * side * ((side + DISTI_BRICKS - 1) / DISTI_BRICKS), disti_cache_task, &job);
+    disti_stats_end(ctx, &tracer, &stats);
+    cache->queries = stats.queries;
+    return DIST_OK;
+}
+
+static dist_status disti_cache_take(dist_context *ctx, int resolution, const char *function, dist_cache *cache)
+{
+    memset(cache, 0, sizeof *cache);
+    cache->ctx = ctx;
+    if (resolution < 0 || resolution > 512 || resolution % DISTI_BRICK)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: resolution is %d, must be a multiple of 8 to 512 (0: 64)",
+                          function, resolution, 0);
+    cache->resolution = resolution ? resolution : 64;
+    size_t n = (size_t)cache->resolution;
+    cache->at = (unsigned char *)disti_alloc(ctx, n * n * n);
+    return cache->at ? DIST_OK : DIST_OUT_OF_MEMORY;
+}
+
+DIST_API dist_cache *dist_cache_create(dist_context *ctx, const dist_field *field, int resolution)
+{
+    const char *name = "dist_cache_create";
+    if (disti_enter(ctx) != DIST_OK) return NULL;
+    dist_cache *cache = (dist_cache *)disti_alloc(ctx, sizeof *cache);
+    if (!cache) return NULL;
+    dist_status status = disti_cache_take(ctx, resolution, name, cache);
+    if (status == DIST_OK) status = disti_cache_make(cache, field, name);
+    if (status == DIST_OK) return cache;
+    dist_cache_destroy(cache);
+    return NULL;
+}
+
+DIST_API void dist_cache_destroy(dist_cache *cache)
+{
+    if (!cache) return;
+    size_t n = (size_t)cache->resolution;
+    disti_free(cache->ctx, cache->at, n * n * n);
+    disti_free(cache->ctx, cache, sizeof *cache);
+}
+
+DIST_API dist_status dist_cache_update(dist_cache *cache, const dist_field *field)
+{
+    if (!cache) return DIST_BAD_ARGUMENT;
+    dist_status status = disti_enter(cache->ctx);
+    return status == DIST_OK ? disti_cache_make(cache, field, "dist_cache_update") : status;
+}
+
+DIST_API dist_field dist_cache_field(const dist_cache *cache)
+{
+    dist_field field;
+    memset(&field, 0, sizeof field);
+    if (!cache) return field;
+    field = cache->field;
+    field.cache = cache;
+    return field;
+}
+
+DIST_API unsigned long long dist_cache_queries(const dist_cache *cache) { return cache ? cache->queries : 0; }
+
+/* Nearest points and contacts. Steps of Newton along the gradient lead from p onto the surface, P; of a distance that
+   is all. From there it slides: with each step down also along the surface, toward where its tangent plane is nearest
+   to p. That takes a few queries where the surface is smooth, and may come to no end in a crease. Then, from the
+   nearest x found, a share of the way back to p and down again, x' = P(x + share (p - x)), which stays where x is
+   nearest, in creases too, cannot overshoot where the surface bends away, and may find another part of the surface,
+   before this one; a quarter of the share where that came no nearer. */
 typedef struct disti_foot {
     float p[3], x[3];
     float best[3], normal[3]; /* nearest surface point so far, grad f there at unit length; before there is one: the
@@ -10246,11 +10554,12 @@ typedef struct disti_foot {
     float radius;    /* p is a sphere's center; 3e38: none */
     float away;      /* of p from the bounding sphere; 0: within */
     float f, damping, share;
+    float rest[3], relax; /* the last slide's, and by which share of it */
     float sign;
-    unsigned char status, steps, sides; /* sides: 1 a sample was outside, 2 inside */
+    unsigned char status, steps, slides, sides; /* sides: 1 a sample was outside, 2 inside */
 } disti_foot;
 
-enum { DISTI_FEET = 512, DISTI_FOOT_STEPS = 96 };
+enum { DISTI_FEET = 512, DISTI_FOOT_STEPS = 96, DISTI_FOOT_SLIDES = 16 }; /* slides among the first steps */
 
 /* Of a way to a point as far off as a float can say, whose square it cannot. */
 static float disti_foot_length(const float d[3])
@@ -10269,10 +10578,10 @@ static float disti_foot_move(const dist_field *field, float *x, const float *n, 
     return DISTI_MAX(length - field->radius, 0.0f);
 }
 
-/* x is on the surface, n its normal. */
-static int disti_foot_arrive(const dist_field *field, disti_foot *foot, const float *n)
+/* Notes x, which is on the surface with the normal n, if it is the nearest so far, and by how much. */
+static float disti_foot_arrive(disti_foot *foot, const float *n)
 {
-    float d[3], r = field->radius, reach = field->clamp > 0.0f ? 0.5f * field->clamp : 2.0f * r;
+    float d[3];
     for (int i = 0; i < 3; i++) d[i] = foot->p[i] - foot->x[i];
     float distance = disti_foot_length(d), gain = foot->distance - distance;
     if (gain > 0.0f || foot->status != DIST_RAY_HIT) {
@@ -10281,8 +10590,43 @@ static int disti_foot_arrive(const dist_field *field, disti_foot *foot, const fl
         foot->distance = distance;
     }
     foot->status = DIST_RAY_HIT;
-    if (gain < 1e-5f * r) foot->share *= 0.5f;
-    if (foot->share < 0.02f || foot->distance <= foot->least * 1.00002f + 2e-6f * r) return 0;
+    return gain;
+}
+
+/* Slides toward where the plane at x across n, a distance `down` against it, is nearest to p: along the surface by a
+   share of r, the way to p without its part along n. Where the surface is bent that goes too far or not far enough; two
+   in a row tell by how much (Aitken's relaxation): share' = -share r . (r' - r) / |r' - r|^2. 0: r is so short that no
+   more than a millionth of the radius is to be gained, |r|^2 / (2 |p - x|). */
+static int disti_foot_slide(const dist_field *field, disti_foot *foot, const float *n, float down, int on)
+{
+    float d[3], rest[3], along = 0.0f, square = 0.0f, change = 0.0f, both = 0.0f;
+    float reach = field->clamp > 0.0f ? 0.5f * field->clamp : field->radius;
+    for (int i = 0; i < 3; i++) {
+        d[i] = foot->p[i] - foot->x[i];
+        along += d[i] * n[i];
+    }
+    for (int i = 0; i < 3; i++) {
+        rest[i] = d[i] - along * n[i];
+        square += rest[i] * rest[i];
+        change += (rest[i] - foot->rest[i]) * (rest[i] - foot->rest[i]);
+        both += foot->rest[i] * (rest[i] - foot->rest[i]);
+    }
+    if (on && square <= 2e-6f * field->radius * disti_foot_length(d)) return 0;
+    if (foot->slides++ > 0 && change > 0.0f)
+        foot->relax = DISTI_MIN(DISTI_MAX(-foot->relax * both / change, 0.05f), 2.0f);
+    memcpy(foot->rest, rest, sizeof rest);
+    float share = DISTI_MIN(foot->relax, reach / sqrtf(DISTI_MAX(square, 1e-30f)));
+    for (int i = 0; i < 3; i++) foot->x[i] -= down * n[i];
+    disti_foot_move(field, foot->x, rest, share);
+    return 1;
+}
+
+/* From the nearest point so far a share of the way back to p. */
+static int disti_foot_pull(const dist_field *field, disti_foot *foot, float gain)
+{
+    float d[3], r = field->radius, reach = field->clamp > 0.0f ? 0.5f * field->clamp : 2.0f * r;
+    if (gain < 1e-5f * r) foot->share *= 0.25f;
+    if (foot->share < 0.02f) return 0;
     float share = DISTI_MIN(foot->share, reach / foot->distance);
     for (int i = 0; i < 3; i++) d[i] = foot->p[i] - foot->best[i];
     memcpy(foot->x, foot->best, sizeof foot->x);
@@ -10318,8 +10662,14 @@ static int disti_foot_advance(const dist_field *field, disti_foot *foot, float f
             return 0;
         }
     }
-    if (size <= 2e-6f * field->radius * DISTI_MAX(slope, 0.25f)) return disti_foot_arrive(field, foot, n);
+    int on = size <= 2e-6f * field->radius * DISTI_MAX(slope, 0.25f);
+    float gain = on ? disti_foot_arrive(foot, n) : 0.0f;
+    if (on && foot->distance <= foot->least * 1.00002f + 2e-6f * field->radius) return 0;
     if (foot->steps >= DISTI_FOOT_STEPS) return 0;
+    if (foot->steps < DISTI_FOOT_SLIDES && foot->status == DIST_RAY_HIT &&
+        (on || (slope > 0.5f * lipschitz && size < 0.02f * field->radius)))
+        return disti_foot_slide(field, foot, n, f / slope, on);
+    if (on) return disti_foot_pull(field, foot, gain);
     if (foot->status != DIST_RAY_HIT) {
         memcpy(f > 0.0f ? foot->best : foot->normal, foot->x, sizeof foot->x);
         foot->sides |= (unsigned char)(f > 0.0f ? 1 : 2);
@@ -10369,13 +10719,16 @@ static void disti_foot_task(void *arg, int index, int worker)
         memcpy(foot->x, p, sizeof foot->x);
         foot->distance = 3e38f;
         foot->radius = job->contacts ? p[3] : 3e38f;
-        foot->damping = foot->sign = 1.0f;
+        foot->damping = foot->relax = foot->sign = 1.0f;
         foot->share = 0.5f;
         foot->status = DIST_RAY_NOT_FINITE;
         if (!disti_finite_all(job->stride, p)) continue;
         foot->away = disti_foot_move(field, foot->x, zero, 0.0f);
-        foot->status = job->contacts && foot->away >= foot->radius ? DIST_RAY_MISS : DIST_RAY_UNRESOLVED;
-        if (foot->status == DIST_RAY_MISS) foot->distance = foot->away;
+        float clear[3] = {foot->away, 0.0f, 0.0f};
+        if (job->contacts && field->cache) clear[1] = disti_cache_clear(field->cache, foot->x);
+        float least = disti_foot_length(clear);
+        foot->status = job->contacts && least >= foot->radius ? DIST_RAY_MISS : DIST_RAY_UNRESOLVED;
+        if (foot->status == DIST_RAY_MISS) foot->distance = least;
         else bench.index[active++] = (int)i;
     }
     while (active > 0) {
@@ -15618,6 +15971,7 @@ DIST_API size_t dist_workspace_bytes(const dist_workspace_desc *desc)
     dist_context ctx;
     dist_net net, texture;
     dist_tape tape;
+    dist_cache cache;
     disti_measure m;
     dist_allocator counting = {&m, disti_measure_alloc, disti_measure_free};
     const char *name = "dist_workspace_bytes";
@@ -15655,6 +16009,10 @@ DIST_API size_t dist_workspace_bytes(const dist_workspace_desc *desc)
         status = disti_tape_check(&ctx, d.camera, d.how);
         disti_alloc(&ctx, sizeof tape);
         if (status == DIST_OK) status = disti_tape_take(&ctx, &tape, d.camera, d.how);
+    }
+    if (status == DIST_OK && d.cache) {
+        disti_alloc(&ctx, sizeof cache);
+        status = disti_cache_take(&ctx, d.cache, name, &cache);
     }
     return status == DIST_OK && m.bytes != (size_t)-1 ? m.bytes : 0;
 }

@@ -3,10 +3,11 @@
 # and plots NAME*.svg (work_precision: plots into build; bench/results has what make results makes). From the root of
 # the repository, with the programs built in build/: make bench.
 #
-#   sh bench/run.sh [NAME...]      all, or only these: net blas step trace grow scene needs fit work_precision code_size
+#   sh bench/run.sh [NAME...]      all, or only these: net blas step trace grow cache scene needs fit work_precision
+#                                  code_size
 
 results=bench/results
-names=${*:-net blas step trace grow scene needs fit work_precision code_size}
+names=${*:-net blas step trace grow cache scene needs fit work_precision code_size}
 mkdir -p "$results" || exit 1
 DIST_ORIGIN=$(sh bench/machine.sh)
 export DIST_ORIGIN
@@ -71,6 +72,11 @@ for bench in $names; do
             dots trace '' 'Both tracers: queries, time and error' --rows case,resolution --series method \
                 --panel queries:log --panel seconds:log --panel mean_error:log --panel p99_error:log --panel holes \
                 --panel false_hits --open holes:10 --open-means 'more than 10 holes'
+        ;;
+    cache)
+        csv cache "$program" && dots cache '' 'What a cache of empty space saves' --rows case,resolution \
+            --panel of_queries --panel of_seconds --columns 2 \
+            --note 'of what the same rays, or spheres, take without one (resolution 0)'
         ;;
     scene)
         csv scene "$program" --quick && dots scene '' 'Instances of one network' --rows case \

@@ -187,6 +187,9 @@ static inline canvas picture_lit(dist_context *ctx, const dist_field *field, con
     float *highlight = take_floats(3 * l.n), eye[3], ahead[3];
     paint_background(&c);
     dist_camera_ray(camera, 0.0f, 0.0f, eye, ahead);
+    dist_cache *cache = how->occlusion > 0 ? dist_cache_create(ctx, field, 0) : NULL; /* so many rays pay for it */
+    dist_field cached = dist_cache_field(cache);
+    if (cache) { field = &cached; }
     lit_add_ambient(ctx, field, &l, how);
     for (int i = 0; i < how->count; i++) {
         const float *t = how->lights[i].toward;
@@ -204,6 +207,7 @@ static inline canvas picture_lit(dist_context *ctx, const dist_field *field, con
         canvas_set(&c, l.pixel[k] % camera->width, l.pixel[k] / camera->width, falls[0] * albedo[0] + shine[0],
                    falls[1] * albedo[1] + shine[1], falls[2] * albedo[2] + shine[2]);
     }
+    dist_cache_destroy(cache);
     free(highlight);
     lit_end(&l);
     return c;

@@ -349,6 +349,55 @@ TEST(closest_points_of_networks_lie_on_their_surface)
 }
 
 /* Boards thinner than a step of Newton: the walk goes to and fro in them until it bisects. */
+static unsigned long long asked;
+
+static void counted_eval(void *user, int worker, size_t n, const float *at, float *sdf, float *gradient)
+{
+    const dist_field *field = (const dist_field *)user;
+    asked += n;
+    field->eval_fn(field->user, worker, n, at, sdf, gradient);
+}
+
+/* By the plane that touches the surface, not by ever smaller shares of the way. */
+TEST(closest_points_of_smooth_surfaces_take_a_few_queries)
+{
+    static const model_desc descs[2] = {
+        {.name = "softplus", .code_size = 2, .activation = DIST_ACTIVATION_SOFTPLUS, .first_scale = 4.0},
+        {.name = "relu", .code_size = 2, .width = 16, .clamp = 0.3}};
+    static const double most[3] = {7, 12, 50}; /* the shares alone take 17, 60 and 61 */
+    dist_context *ctx = shape_context();
+    for (int k = 0; k < 3; k++) {
+        const float torus[5] = {0, 0, 0, 0.55f, 0.2f};
+        double code[MODEL_CODE] = {0.25, 0.25};
+        float codef[2] = {0.25f, 0.25f};
+        test_random random = test_random_seed(47 + (unsigned)k);
+        dist_field field = dist_field_torus(torus);
+        dist_net *net = NULL;
+        dist_shape *shape = NULL;
+        model m;
+        if (k > 0) {
+            m = model_make(&descs[k - 1], 7);
+            model_fit_ball(&m, code, 0.6);
+            net = model_load(ctx, &m);
+            shape = dist_shape_create(ctx, net, codef);
+            field = dist_shape_field(shape);
+        }
+        dist_field counted = field;
+        counted.user = &field;
+        counted.eval_fn = counted_eval;
+        counted.changes_fn = NULL;
+        asked = 0;
+        make_points(&random, 3, 1.0f);
+        CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &counted, RAYS, points, closest, distance, status), ctx);
+        if (test_state.verbose) printf("    %.2f queries a point\n", (double)asked / RAYS);
+        CHECK((double)asked < most[k] * RAYS);
+        dist_shape_destroy(shape);
+        dist_net_destroy(net);
+        if (k > 0) model_free(&m);
+    }
+    dist_context_destroy(ctx);
+}
+
 TEST(closest_points_of_thin_boards_are_found)
 {
     static float sdf[RAYS];
@@ -633,6 +682,7 @@ int main(int argc, char **argv)
     RUN(closest_points_of_distances_are_exact);
     RUN(closest_points_of_other_fields_are_on_the_surface_and_near);
     RUN(closest_points_of_networks_lie_on_their_surface);
+    RUN(closest_points_of_smooth_surfaces_take_a_few_queries);
     RUN(closest_points_of_thin_boards_are_found);
     RUN(contacts_have_the_depth_and_the_normal_of_the_shape);
     RUN(spheres_that_are_clear_cost_one_query_or_none);

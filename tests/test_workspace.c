@@ -67,6 +67,7 @@ static void use_run(use *u, bump *arena)
     dist_instance instances[MOST_INSTANCES];
     dist_scene *scene = NULL;
     dist_tape *tape = NULL;
+    dist_cache *cache = NULL;
     dist_field field;
     dist_camera camera = dist_camera_look_at(SIDE, SIDE, 0.9f, (float[3]){0, 0, 4}, (float[3]){0, 0, 0},
                                              (float[3]){0, 1, 0});
@@ -78,7 +79,7 @@ static void use_run(use *u, bump *arena)
     context.allocator.alloc_fn = bump_alloc;
     context.allocator.free_fn = bump_free;
     u->wanted = 1 + (d->model != NULL) + (d->texture != NULL) + shape_count * (d->texture || d->texture_net ? 2 : 1) +
-                (d->instances > 0) + (d->camera != NULL);
+                (d->instances > 0) + (d->camera != NULL) + (d->cache != 0);
     u->made = 0;
     u->status = DIST_OUT_OF_MEMORY;
     strcpy(u->sentence, "no context");
@@ -108,6 +109,8 @@ static void use_run(use *u, bump *arena)
     }
     if (d->camera) tape = dist_tape_create(ctx, d->camera, d->how);
     u->made += tape != NULL;
+    if (d->cache) cache = dist_cache_create(ctx, &field, d->cache);
+    u->made += cache != NULL;
     u->status = dist_context_status(ctx);
     memcpy(u->sentence, dist_context_message(ctx), strlen(dist_context_message(ctx)) + 1);
     if (u->made == u->wanted) { /* in use nothing is asked for */
@@ -131,8 +134,10 @@ static void use_run(use *u, bump *arena)
         d_out.depth = d_out.silhouette = planes[2];
         if (field.code_size > 0) grads.code = d_code;
         if (taped) CHECK_STATUS(DIST_OK, dist_render_backward(ctx, tape, &d_out, &grads), ctx);
+        if (cache) CHECK_STATUS(DIST_OK, dist_cache_update(cache, &field), ctx);
         CHECK_EQUAL(used, arena->used);
     }
+    dist_cache_destroy(cache);
     dist_tape_destroy(tape);
     dist_scene_destroy(scene);
     for (int i = 0; i < shape_count; i++) dist_shape_destroy(shapes[i]);
@@ -220,6 +225,7 @@ TEST(an_arena_of_exactly_so_many_bytes_suffices)
                 if (paint == 1) u.desc.texture_net = made;
             }
             if (tape) u.desc.camera = &cameras[tape - 1];
+            if (turn % 2 && (i < 0 || m.sdf_channel >= 0)) u.desc.cache = test_random_int(&r, 0, 3) * 8;
             u.desc.how = tape ? &hows[test_random_int(&r, 0, 2)] : NULL;
             size_t bytes = use_check(&u);
             least = bytes < least ? bytes : least;

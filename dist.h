@@ -232,9 +232,10 @@ typedef struct dist_field {
     int color_code_size;       /* length of d_color_code */
     size_t color_weight_count; /* of a color net of its own; 0: the weights of color, if any, are among weight_count */
     dist_context *owner; /* the context that made it; NULL: any */
-    /* counts the changes of what user points to, so that a cache of what it was is refused. Set by dist_shape_field and
-       dist_scene_field; NULL: that is not looked at */
-    unsigned (*changes_fn)(const void *user);
+    /* a number that changes with what user points to, so that a cache of what it was is refused. Set by
+       dist_shape_field and dist_scene_field, whose functions give 0 where eval_fn is not theirs any more; NULL: that is
+       not looked at */
+    unsigned (*changes_fn)(const struct dist_field *field);
     const struct dist_cache *cache; /* set by dist_cache_field; NULL: none */
 } dist_field;
 
@@ -592,7 +593,8 @@ typedef struct dist_cache dist_cache;
 DIST_API dist_cache *dist_cache_create(dist_context *ctx, const dist_field *field, int resolution);
 DIST_API void dist_cache_destroy(dist_cache *cache);
 /* The field with its cache, to be traced instead of it. Borrows both. As soon as the shape's code, the net's weights or
-   the scene have changed every call refuses it; a field of your own without changes_fn must not change. */
+   the scene have changed every call refuses it; a field of your own without changes_fn must not change. A cache serves
+   Lipschitz figures up to those it was made with: raise field.lipschitz before, not how.lipschitz for dist_trace. */
 DIST_API dist_field dist_cache_field(const dist_cache *cache);
 /* Makes it anew for a field that has changed, or another one; then take dist_cache_field again. No allocator call. */
 DIST_API dist_status dist_cache_update(dist_cache *cache, const dist_field *field);
@@ -3740,7 +3742,6 @@ DISTI_ANALYTIC(box, 6, disti_length(c[3], c[4], c[5]))
 #define DISTI_RADIUS_LEAST 1e-15f
 #define DISTI_RADIUS_MOST 1e15f
 
-/* What makes a field unusable, for every function that takes one. */
 /* See 07 trace. at: for each cell by how far the center is from the surface at least, in units, rounded down; 0: not
    known to be outside. */
 struct dist_cache {
@@ -3756,27 +3757,39 @@ struct dist_cache {
 
 static unsigned disti_changes(const dist_field *field)
 {
-    return field->changes_fn ? field->changes_fn(field->user) : 0;
+    return field->changes_fn ? field->changes_fn(field) : 0;
 }
 
-/* Whether what the cache shows to be empty is so for this field, with these figures. */
-static dist_status disti_cache_check(dist_context *ctx, const dist_field *field, float lipschitz, float lipschitz_far,
-                                     const char *function)
+/* The figure from |f| = disti_far_from on. */
+static float disti_lipschitz_far(const dist_field *field)
+{
+    return field->lipschitz_far > 0.0f ? field->lipschitz_far : field->lipschitz > 0.0f ? field->lipschitz : 1.0f;
+}
+
+/* Whether what the cache shows to be empty is so for this field. */
+static dist_status disti_cache_check(dist_context *ctx, const dist_field *field, const char *function)
 {
     const dist_cache *cache = field->cache;
     const dist_field *own = &cache->field;
+    float lipschitz = field->lipschitz > 0.0f ? field->lipschitz : 1.0f;
+    if (cache->ctx != ctx) return disti_refuse(ctx, "%s: field.cache belongs to another context", function);
     int same = field->user == own->user && field->eval_fn == own->eval_fn && field->radius == own->radius &&
                memcmp(field->center, own->center, sizeof field->center) == 0 && field->clamp == own->clamp;
     if (!same || disti_changes(field) != cache->changes)
         return disti_refuse(ctx, "%s: field.cache was made of another field, or that has changed since; see "
                                  "dist_cache_update", function);
-    if (lipschitz > cache->lipschitz || lipschitz_far > cache->lipschitz_far)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: the Lipschitz figure is %d, but field.cache was made with %d; "
-                                                  "see dist_cache_update", function, (double)lipschitz,
+    if (lipschitz > cache->lipschitz)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.lipschitz is %d, but field.cache was made with %d; see "
+                                                  "dist_cache_update", function, (double)lipschitz,
                           (double)cache->lipschitz);
+    if (disti_lipschitz_far(field) > cache->lipschitz_far)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.lipschitz_far is %d, but field.cache was made with %d; "
+                                                  "see dist_cache_update", function,
+                          (double)disti_lipschitz_far(field), (double)cache->lipschitz_far);
     return DIST_OK;
 }
 
+/* What makes a field unusable, for every function that takes one. */
 static dist_status disti_field_check(dist_context *ctx, const dist_field *field, const char *function)
 {
     if (!field) return disti_refuse(ctx, "%s: field is NULL", function);
@@ -3800,10 +3813,7 @@ static dist_status disti_field_check(dist_context *ctx, const dist_field *field,
     dist_status status = disti_limits(ctx, function, sizeof limits / sizeof limits[0], limits);
     if (status != DIST_OK) return status;
     if (field->owner && field->owner != ctx) return disti_refuse(ctx, "%s: field belongs to another context", function);
-    if (!field->cache) return DIST_OK;
-    float lipschitz = field->lipschitz > 0.0f ? field->lipschitz : 1.0f;
-    return disti_cache_check(ctx, field, lipschitz, field->lipschitz_far > 0.0f ? field->lipschitz_far : lipschitz,
-                             function);
+    return field->cache ? disti_cache_check(ctx, field, function) : DIST_OK;
 }
 
 enum { DISTI_CHUNK = DISTI_SLOTS * 4 * DISTI_BLOCK }; /* points of a backward pass held at once */
@@ -4772,7 +4782,7 @@ static dist_status disti_scene_place(dist_scene *scene, int k, const dist_instan
             return disti_fail(ctx, DIST_BAD_ARGUMENT,
                               "%s: placement.translation puts the bounding sphere's center at %d on axis %d; must be "
                               "within 1e15 of 0", function, (double)ball.center[i], (double)i);
-    scene->changes += 1 + disti_changes(&placed->field); /* so that the sum over all never falls */
+    scene->changes++;
     *placed = next;
     scene->ball[k] = ball;
     return DIST_OK;
@@ -4874,12 +4884,14 @@ static float disti_scene_bound(const dist_scene *scene, float center[3])
     return (float)(scene->count > 1 ? least * (1.0 + 1e-6) : least);
 }
 
-static unsigned disti_scene_changes(const void *user)
+/* A hash of how often it was set and of its instances' numbers, each of which only grows. */
+static unsigned disti_scene_changes(const dist_field *field)
 {
-    const dist_scene *scene = (const dist_scene *)user;
-    unsigned changes = scene->changes;
-    for (int k = 0; k < scene->count; k++) changes += disti_changes(&scene->placed[k].field);
-    return changes;
+    if (field->eval_fn != disti_scene_eval) return 0;
+    const dist_scene *scene = (const dist_scene *)field->user;
+    uint32_t hash = (2166136261u ^ scene->changes) * 16777619u;
+    for (int k = 0; k < scene->count; k++) hash = (hash ^ disti_changes(&scene->placed[k].field)) * 16777619u;
+    return hash;
 }
 
 DIST_API dist_field dist_scene_field(dist_scene *scene)
@@ -6483,7 +6495,7 @@ static void disti_fold_sum(const dist_shape *shape, disti_block *b, const float 
 static int disti_net_few(const dist_shape *shape, const disti_block *b, size_t n)
 {
     const dist_net *net = shape->net;
-    return b->values && n <= (size_t)b->kernels.few_points && net->activation == DIST_ACTIVATION_RELU && !net->normed &&
+    return n <= (size_t)b->kernels.few_points && net->activation == DIST_ACTIVATION_RELU && !net->normed &&
            net->layers > 1 && !shape->ctx->blas.sgemm_fn;
 }
 
@@ -6492,7 +6504,7 @@ static int disti_net_few(const dist_shape *shape, const disti_block *b, size_t n
 static size_t disti_net_part(const dist_shape *shape, const disti_block *b, size_t n)
 {
     const disti_part *part = b->kernels.parts;
-    if (!part || !shape->wide || !disti_net_few(shape, b, (size_t)b->kernels.few_points)) return n;
+    if (!part || !b->values || !shape->wide || !disti_net_few(shape, b, (size_t)b->kernels.few_points)) return n;
     while (part->least && n > (size_t)part->most) part++;
     return part->least && n >= (size_t)part->least ? (size_t)part->points : n;
 }
@@ -6513,6 +6525,12 @@ static const float *disti_few_forward(const dist_shape *shape, disti_block *b, d
         for (int u = 0; u < layer->prev; u++) {
             list[count] = u;
             count += most[u] > 0.0f;
+        }
+        b->alive_units[l] = count;
+        for (int i = 0; i < count && !b->values; i++) { /* for the way back */
+            uint64_t *mask = b->mask + (size_t)l * width + list[i];
+            *mask = 0;
+            for (size_t c = 0; c < points; c++) *mask |= (uint64_t)(x[c * width + (size_t)list[i]] > 0.0f) << c;
         }
         for (int i = 0; i < layer->point; i++, count++) {
             list[count] = layer->prev + i;
@@ -7533,9 +7551,10 @@ static void disti_shape_slope(dist_shape *shape, const dist_field *field)
     disti_float_state_leave(state);
 }
 
-static unsigned disti_shape_changes(const void *user)
+static unsigned disti_shape_changes(const dist_field *field)
 {
-    const dist_shape *shape = (const dist_shape *)user;
+    if (field->eval_fn != disti_shape_eval_fn && field->eval_fn != field->coarse_fn) return 0;
+    const dist_shape *shape = (const dist_shape *)field->user;
     return shape->changes + shape->net->changes;
 }
 
@@ -8054,6 +8073,7 @@ DIST_API dist_status dist_net_set_half(dist_context *ctx, dist_net *net, int kin
     net->half_panels = panels;
     net->half_count = count;
     net->half = kind;
+    net->changes++;
     if (kind != DIST_HALF_OFF) disti_half_pack(net);
     return DIST_OK;
 }
@@ -9068,8 +9088,7 @@ static dist_status disti_tracer_init(disti_tracer *tracer, dist_context *ctx, co
     tracer->epsilon = DISTI_MAX(tracer->epsilon, tracer->how.epsilon > 0.0f ? tracer->noise : 0.0f);
     tracer->cache = NULL;
     tracer->shy = DISTI_MAX(tracer->epsilon, 5e-5f * tracer->detail) / tracer->lipschitz;
-    if (!field->cache || !(tracer->how.lipschitz > 0.0f)) return DIST_OK;
-    return disti_cache_check(ctx, field, tracer->lipschitz, tracer->lipschitz, function);
+    return DIST_OK;
 }
 
 /* Radius of the sphere around a point with this |f| in which the Lipschitz figures allow no surface. */
@@ -10362,6 +10381,11 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
         return disti_refuse(ctx, "dist_trace: how.%s is for pictures, must be 0",
                             tracer.how.warm_start ? "warm_start" : "trace DIST_TRACE_PAPER");
     tracer.cache = field->cache;
+    float most = field->cache ? DISTI_MIN(field->cache->lipschitz, field->cache->lipschitz_far) : 0.0f;
+    if (tracer.cache && tracer.how.lipschitz > most)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT,
+                          "dist_trace: how.lipschitz is %d, must be at most the %d that field.cache was made with; raise "
+                          "field.lipschitz before dist_cache_create", NULL, (double)tracer.how.lipschitz, (double)most);
     disti_stats_begin(ctx);
     disti_free_job job = {&tracer, n, origins, directions, hits};
     disti_run(ctx, (int)((n + DISTI_FREE_RAYS - 1) / DISTI_FREE_RAYS), disti_free_task, &job);
@@ -10475,7 +10499,7 @@ static dist_status disti_cache_make(dist_cache *cache, const dist_field *field, 
     cache->inverse = 1.0f / cache->cell;
     cache->unit = 0.25f * cache->cell;
     cache->lipschitz = tracer.lipschitz;
-    cache->lipschitz_far = tracer.lipschitz / tracer.ratio;
+    cache->lipschitz_far = disti_lipschitz_far(&own);
     for (int i = 0; i < 3; i++) cache->corner[i] = own.center[i] - own.radius;
     disti_stats_begin(ctx);
     disti_cache_job job = {cache, &tracer};
@@ -10551,6 +10575,7 @@ typedef struct disti_foot {
                                  last samples outside and inside */
     float distance;  /* from p to it, 3e38: none yet; of a miss: the least there can be */
     float least;     /* no surface is nearer to p than this */
+    float told;      /* |f| at p, or at where p is moved to in the bounding sphere, and the way there */
     float radius;    /* p is a sphere's center; 3e38: none */
     float away;      /* of p from the bounding sphere; 0: within */
     float f, damping, share;
@@ -10656,6 +10681,7 @@ static int disti_foot_advance(const dist_field *field, disti_foot *foot, float f
         least = disti_foot_length(way);
         foot->sign = f < 0.0f && foot->away <= 0.0f ? -1.0f : 1.0f;
         foot->least = least;
+        foot->told = size + foot->away;
         if (foot->sign > 0.0f && foot->radius < 3e38f && least >= foot->radius) {
             foot->status = DIST_RAY_MISS;
             foot->distance = least;
@@ -10666,9 +10692,11 @@ static int disti_foot_advance(const dist_field *field, disti_foot *foot, float f
     float gain = on ? disti_foot_arrive(foot, n) : 0.0f;
     if (on && foot->distance <= foot->least * 1.00002f + 2e-6f * field->radius) return 0;
     if (foot->steps >= DISTI_FOOT_STEPS) return 0;
-    if (foot->steps < DISTI_FOOT_SLIDES && foot->status == DIST_RAY_HIT &&
-        (on || (slope > 0.5f * lipschitz && size < 0.02f * field->radius)))
-        return disti_foot_slide(field, foot, n, f / slope, on);
+    if (foot->steps < DISTI_FOOT_SLIDES && foot->status == DIST_RAY_HIT && slope > (on ? 0.1f : 0.5f) * lipschitz &&
+        (on || size < 0.02f * field->radius)) {
+        if (disti_foot_slide(field, foot, n, f / slope, on)) return 1;
+        if (foot->distance * slope <= 1.2f * foot->told) return 0; /* about as far as f said at p */
+    }
     if (on) return disti_foot_pull(field, foot, gain);
     if (foot->status != DIST_RAY_HIT) {
         memcpy(f > 0.0f ? foot->best : foot->normal, foot->x, sizeof foot->x);
@@ -10727,7 +10755,8 @@ static void disti_foot_task(void *arg, int index, int worker)
         float clear[3] = {foot->away, 0.0f, 0.0f};
         if (job->contacts && field->cache) clear[1] = disti_cache_clear(field->cache, foot->x);
         float least = disti_foot_length(clear);
-        foot->status = job->contacts && least >= foot->radius ? DIST_RAY_MISS : DIST_RAY_UNRESOLVED;
+        int clear_of = job->contacts && least > 0.0f && least >= foot->radius;
+        foot->status = (unsigned char)(clear_of ? DIST_RAY_MISS : DIST_RAY_UNRESOLVED);
         if (foot->status == DIST_RAY_MISS) foot->distance = least;
         else bench.index[active++] = (int)i;
     }

@@ -129,7 +129,6 @@ int main(int argc, char **argv)
     dist_field plain = c.field;
     plain.user = &c;
     plain.eval_fn = counted_eval;
-    plain.changes_fn = NULL;
     check(ctx);
 
     size_t pixels = (size_t)size * (size_t)size;

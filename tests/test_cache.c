@@ -279,16 +279,89 @@ TEST(a_cache_of_what_has_changed_is_refused_until_it_is_made_anew)
     dist_field with = dist_cache_field(cache), moved = with;
     CHECK_STATUS(DIST_OK, trace_one(ctx, &with, 0.9f * field.lipschitz), ctx);
     CHECK_STATUS(DIST_BAD_ARGUMENT, trace_one(ctx, &with, 2.0f * field.lipschitz), ctx);
-    CHECK_TEXT("the Lipschitz figure is", dist_context_message(ctx));
+    CHECK_TEXT("dist_trace: how.lipschitz is", dist_context_message(ctx));
     with.lipschitz *= 2;
     CHECK_STATUS(DIST_BAD_ARGUMENT, trace_one(ctx, &with, 0), ctx);
+    CHECK_TEXT("dist_trace: field.lipschitz is", dist_context_message(ctx));
+    dist_context_clear(ctx);
+    CHECK_STATUS(DIST_OK, dist_cache_update(cache, &with), ctx);
+    with = dist_cache_field(cache);
+    CHECK_STATUS(DIST_OK, trace_one(ctx, &with, 1.0f), ctx);
     moved.center[0] += 0.5f;
     CHECK_STATUS(DIST_BAD_ARGUMENT, trace_one(ctx, &moved, 0), ctx);
     CHECK_TEXT(changed, dist_context_message(ctx));
+    dist_context *other = test_context();
+    const float ball[4] = {0, 0, 0, 0.5f};
+    dist_field sphere = dist_field_sphere(ball);
+    CHECK_STATUS(DIST_OK, dist_cache_update(cache, &sphere), ctx);
+    with = dist_cache_field(cache);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, trace_one(other, &with, 0), other);
+    CHECK_TEXT("field.cache belongs to another context", dist_context_message(other));
+    dist_context_destroy(other);
     dist_cache_destroy(all);
     dist_cache_destroy(cache);
     dist_scene_destroy(scene);
     dist_shape_destroy(shape);
+    dist_net_destroy(net);
+    dist_context_destroy(ctx);
+}
+
+/* Whatever its figures are, also where their quotient is not exact. */
+TEST(a_cache_of_what_has_not_changed_is_taken)
+{
+    dist_context *ctx = test_context();
+    test_random random = test_random_seed(9);
+    const float ball[4] = {0, 0, 0, 0.5f};
+    dist_field field = dist_field_sphere(ball);
+    dist_cache *cache = dist_cache_create(ctx, &field, 8);
+    for (int i = 0; i < 2000; i++) {
+        field.lipschitz = i % 5 ? test_random_float(&random, 1, 2) : 0;
+        field.lipschitz_far = i % 3 ? test_random_float(&random, 1, 2) : 0;
+        CHECK_STATUS(DIST_OK, dist_cache_update(cache, &field), ctx);
+        dist_field with = dist_cache_field(cache);
+        CHECK_STATUS(DIST_OK, trace_one(ctx, &with, 0), ctx);
+    }
+    dist_cache_destroy(cache);
+    dist_context_destroy(ctx);
+}
+
+static void wrapped_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    const dist_field *field = (const dist_field *)user;
+    field->eval_fn(field->user, worker, n, points, sdf, gradient);
+}
+
+/* A copy of a field with another eval_fn and user, and an instance whose shape is gone before it is replaced. */
+TEST(what_is_not_the_librarys_own_is_not_asked_whether_it_has_changed)
+{
+    dist_context *ctx = test_context();
+    dist_net_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.layers = 3;
+    desc.width = 16;
+    desc.geometric = 1;
+    dist_net *net = dist_net_create(ctx, &desc);
+    dist_shape *shape = dist_shape_create(ctx, net, NULL), *next = dist_shape_create(ctx, net, NULL);
+    dist_field inner = dist_shape_field(next), wrapper = inner, field = dist_shape_field(shape);
+    wrapper.user = &inner;
+    wrapper.eval_fn = wrapped_eval;
+    dist_instance one;
+    memset(&one, 0, sizeof one);
+    one.field = &field;
+    dist_scene *scene = dist_scene_create(ctx, 1, &one);
+    dist_shape_destroy(shape);
+    one.field = &wrapper;
+    CHECK_STATUS(DIST_OK, dist_scene_set(scene, 0, &one), ctx);
+    CHECK_STATUS(DIST_OK, dist_scene_set(scene, 0, &one), ctx);
+    dist_field all = dist_scene_field(scene);
+    dist_cache *cache = dist_cache_create(ctx, &all, 16), *own = dist_cache_create(ctx, &wrapper, 16);
+    dist_field with = dist_cache_field(cache), alone = dist_cache_field(own);
+    CHECK_STATUS(DIST_OK, trace_one(ctx, &with, 0), ctx);
+    CHECK_STATUS(DIST_OK, trace_one(ctx, &alone, 0), ctx);
+    dist_cache_destroy(own);
+    dist_cache_destroy(cache);
+    dist_scene_destroy(scene);
+    dist_shape_destroy(next);
     dist_net_destroy(net);
     dist_context_destroy(ctx);
 }
@@ -429,6 +502,8 @@ int main(int argc, char **argv)
     RUN(spheres_that_are_clear_of_the_surface_ask_nothing);
     RUN(pictures_are_the_same_with_and_without_a_cache);
     RUN(a_cache_of_what_has_changed_is_refused_until_it_is_made_anew);
+    RUN(a_cache_of_what_has_not_changed_is_taken);
+    RUN(what_is_not_the_librarys_own_is_not_asked_whether_it_has_changed);
     RUN(bad_arguments_and_odd_fields_do_no_harm);
     RUN(a_cache_takes_memory_once_and_gives_all_of_it_back);
     RUN(a_cache_is_the_same_for_any_number_of_workers);

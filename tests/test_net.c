@@ -485,7 +485,7 @@ TEST(the_order_of_units_in_memory_does_not_show)
     dist_context_destroy(ctx);
 }
 
-/* Few points go through kernels of their own: the bits are those of a full block. */
+/* Few points go through kernels of their own, on the way to gradients, too: the bits are those of a full block. */
 TEST(a_few_points_have_the_bits_of_many)
 {
     enum { MANY = 48 };
@@ -501,14 +501,17 @@ TEST(a_few_points_have_the_bits_of_many)
         dist_shape *shape = dist_shape_create(ctx, net, NULL);
         REQUIRE(shape != NULL);
         dist_field field = dist_shape_field(shape);
-        float points[3 * MANY], many[MANY], few[MANY];
+        float points[3 * MANY], many[MANY], few[MANY], slope[3 * MANY], slopes[3 * MANY];
         test_random random = test_random_seed(7);
         test_random_fill(&random, 3 * MANY, points, -0.9f, 0.9f);
-        field.eval_fn(field.user, 0, MANY, points, many, NULL);
+        field.eval_fn(field.user, 0, MANY, points, many, slopes);
         for (int n = 1; n <= MANY; n++) {
             for (int at = 0; at + n <= MANY; at += n) {
                 field.eval_fn(field.user, 0, (size_t)n, points + 3 * at, few, NULL);
                 CHECK_BYTES((size_t)n * sizeof(float), many + at, few);
+                field.eval_fn(field.user, 0, (size_t)n, points + 3 * at, few, slope);
+                CHECK_BYTES((size_t)n * sizeof(float), many + at, few);
+                CHECK_BYTES(3 * (size_t)n * sizeof(float), slopes + 3 * at, slope);
             }
         }
         dist_shape_destroy(shape);

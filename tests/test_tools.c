@@ -348,7 +348,6 @@ TEST(closest_points_of_networks_lie_on_their_surface)
     dist_context_destroy(ctx);
 }
 
-/* Boards thinner than a step of Newton: the walk goes to and fro in them until it bisects. */
 static unsigned long long asked;
 
 static void counted_eval(void *user, int worker, size_t n, const float *at, float *sdf, float *gradient)
@@ -358,13 +357,61 @@ static void counted_eval(void *user, int worker, size_t n, const float *at, floa
     field->eval_fn(field->user, worker, n, at, sdf, gradient);
 }
 
+/* A torus that is hollow: 0 inside, and flat. */
+static void flat_eval(void *user, int worker, size_t n, const float *at, float *sdf, float *gradient)
+{
+    const dist_field *field = (const dist_field *)user;
+    asked += !disti_finite_all(3 * n, at);
+    field->eval_fn(field->user, worker, n, at, sdf, gradient);
+    for (size_t i = 0; i < n; i++) {
+        if (sdf[i] > 0) continue;
+        sdf[i] = 0;
+        for (size_t k = 0; gradient && k < 3; k++) gradient[3 * i + k] = 0;
+    }
+}
+
+TEST(closest_points_of_fields_without_an_inside_are_found)
+{
+    dist_context *ctx = shape_context();
+    const float torus[5] = {0, 0, 0, 0.55f, 0.2f};
+    dist_field field = dist_field_torus(torus), flat = field;
+    test_random random = test_random_seed(3);
+    flat.user = &field;
+    flat.eval_fn = flat_eval;
+    asked = 0;
+    for (int k = 0; k < 4; k++) {
+        flat.lipschitz = (float)(1 + k % 2);
+        make_points(&random, 3, k < 2 ? 1.0f : 3.0f);
+        CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &flat, RAYS, points, closest, distance, status), ctx);
+        for (int i = 0; i < RAYS; i++) CHECK_EQUAL(DIST_RAY_HIT, status[i]);
+        make_points(&random, 4, k < 2 ? 1.0f : 3.0f);
+        for (int i = 0; i < RAYS; i++) points[4 * i + 3] = 0.1f;
+        CHECK_STATUS(DIST_OK, dist_field_collide(ctx, &flat, RAYS, points, contacts), ctx);
+        for (int i = 0; i < RAYS; i++) CHECK(contacts[i].status == DIST_RAY_HIT || contacts[i].status == DIST_RAY_MISS);
+    }
+    CHECK_EQUAL(0, asked); /* nothing where a point is not finite */
+    dist_context_destroy(ctx);
+}
+
+TEST(a_sphere_without_a_radius_is_a_point)
+{
+    dist_context *ctx = shape_context();
+    const float ball[4] = {0, 0, 0, 0.5f}, at[8] = {0.1f, 0, 0, 0, 0.7f, 0, 0, 0};
+    dist_field field = dist_field_sphere(ball);
+    CHECK_STATUS(DIST_OK, dist_field_collide(ctx, &field, 2, at, contacts), ctx);
+    CHECK_EQUAL(DIST_RAY_HIT, contacts[0].status);
+    CHECK_NEAR(0.4, contacts[0].depth, 1e-5);
+    CHECK_EQUAL(DIST_RAY_MISS, contacts[1].status);
+    dist_context_destroy(ctx);
+}
+
 /* By the plane that touches the surface, not by ever smaller shares of the way. */
 TEST(closest_points_of_smooth_surfaces_take_a_few_queries)
 {
     static const model_desc descs[2] = {
         {.name = "softplus", .code_size = 2, .activation = DIST_ACTIVATION_SOFTPLUS, .first_scale = 4.0},
         {.name = "relu", .code_size = 2, .width = 16, .clamp = 0.3}};
-    static const double most[3] = {7, 12, 50}; /* the shares alone take 17, 60 and 61 */
+    static const double most[3] = {7, 12, 50}; /* the shares alone took 17, 60 and 61 */
     dist_context *ctx = shape_context();
     for (int k = 0; k < 3; k++) {
         const float torus[5] = {0, 0, 0, 0.55f, 0.2f};
@@ -385,7 +432,6 @@ TEST(closest_points_of_smooth_surfaces_take_a_few_queries)
         dist_field counted = field;
         counted.user = &field;
         counted.eval_fn = counted_eval;
-        counted.changes_fn = NULL;
         asked = 0;
         make_points(&random, 3, 1.0f);
         CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &counted, RAYS, points, closest, distance, status), ctx);
@@ -398,6 +444,7 @@ TEST(closest_points_of_smooth_surfaces_take_a_few_queries)
     dist_context_destroy(ctx);
 }
 
+/* Boards thinner than a step of Newton: the walk goes to and fro in them until it bisects. */
 TEST(closest_points_of_thin_boards_are_found)
 {
     static float sdf[RAYS];
@@ -682,6 +729,8 @@ int main(int argc, char **argv)
     RUN(closest_points_of_distances_are_exact);
     RUN(closest_points_of_other_fields_are_on_the_surface_and_near);
     RUN(closest_points_of_networks_lie_on_their_surface);
+    RUN(closest_points_of_fields_without_an_inside_are_found);
+    RUN(a_sphere_without_a_radius_is_a_point);
     RUN(closest_points_of_smooth_surfaces_take_a_few_queries);
     RUN(closest_points_of_thin_boards_are_found);
     RUN(contacts_have_the_depth_and_the_normal_of_the_shape);

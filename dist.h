@@ -10384,8 +10384,9 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
     float most = field->cache ? DISTI_MIN(field->cache->lipschitz, field->cache->lipschitz_far) : 0.0f;
     if (tracer.cache && tracer.how.lipschitz > most)
         return disti_fail(ctx, DIST_BAD_ARGUMENT,
-                          "dist_trace: how.lipschitz is %d, must be at most the %d that field.cache was made with; raise "
-                          "field.lipschitz before dist_cache_create", NULL, (double)tracer.how.lipschitz, (double)most);
+                          "dist_trace: how.lipschitz is %d, must be at most the %d that field.cache was made with; "
+                          "raise field.lipschitz before dist_cache_create", NULL, (double)tracer.how.lipschitz,
+                          (double)most);
     disti_stats_begin(ctx);
     disti_free_job job = {&tracer, n, origins, directions, hits};
     disti_run(ctx, (int)((n + DISTI_FREE_RAYS - 1) / DISTI_FREE_RAYS), disti_free_task, &job);

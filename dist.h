@@ -585,8 +585,8 @@ DIST_API dist_status dist_field_closest_point(dist_context *ctx, const dist_fiel
    dist_trace pass what it shows to be empty without a query, and find what they find without it to within the error
    bounds, but for rays that just touch the surface; a sphere of dist_field_collide that is clear of it by a cell or two
    asks nothing. Empty is what the field's Lipschitz figures allow no surface in, as for a picture's cones; pictures,
-   whose rays help each other, do without. bench/bench_cache.c prints what it saves: half to three quarters of the rays'
-   queries. Belongs to the context that made it. */
+   whose rays help each other, do without. bench/bench_cache.c prints what it saves: from a third to three quarters of
+   the rays' queries. Belongs to the context that made it. */
 typedef struct dist_cache dist_cache;
 /* resolution: cells along each side of the cube around the bounding sphere, a multiple of 8 to 512; 0: 64. That many
    bytes to the third power, and about 8 times its square of queries. NULL on failure. */
@@ -6510,7 +6510,7 @@ static size_t disti_net_part(const dist_shape *shape, const disti_block *b, size
 }
 
 /* disti_net_forward of a few points: activations stand (points, max_rows), so that weights fill the vectors. The last
-   layer's input is put into rows, of which alive ones are written. */
+   layer's input is put into rows, of which alive ones are written. With masks where a gradient is wanted. */
 static const float *disti_few_forward(const dist_shape *shape, disti_block *b, disti_counter *counter)
 {
     const dist_net *net = shape->net;

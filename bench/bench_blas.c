@@ -3,8 +3,9 @@
    thread, against the multiply-add peak of the same run. CSV on stdout. `make build/bench_blas` links what is installed
    (libopenblas-dev, libdnnl-dev); set OPENBLAS_CORETYPE=SkylakeX where OpenBLAS does not know the processor.
 
-   dist: dist_field_eval of a whole net, no BLAS. hook: the same with the BLAS as dist_context_desc.blas. kernels, blas,
-   onednn: the square layers alone, each as y = relu(W x + b), the libraries at the batch that suits them best.
+   dist: dist_field_eval of a whole net, no BLAS. hook: the same with the BLAS as dist_context_desc.blas, which by
+   default gets layers of 192 units and more; of narrower ones hook is dist again. kernels, blas, onednn: the square
+   layers alone, each as y = relu(W x + b), the libraries at the batch that suits them best.
    hook and blas take turns, and their times are medians: stderr has the rate of one over that of the other, the
    median, the first and the last quarter of all turns. */
 #define DIST_IMPLEMENTATION

@@ -1154,10 +1154,10 @@ TEST(the_users_blas_gives_the_same_numbers_for_wide_layers_and_is_left_alone_for
     static const int activations[2] = {DIST_ACTIVATION_RELU, DIST_ACTIVATION_SOFTPLUS};
     for (int k = 0; k < 4; k++) {
         blas_result a, b;
-        int width = k % 2 ? 144 : 48;
+        int width = k % 2 ? 208 : 144;
         blas_run(width, 0, activations[k / 2], &a);
         blas_run(width, 1, activations[k / 2], &b);
-        CHECK((b.calls > 0) == (width >= 128));
+        CHECK((b.calls > 0) == (width >= 192));
         CHECK_NEAR_ARRAY(POINTS, a.sdf, b.sdf, 1e-6);
         CHECK_NEAR_ARRAY(3 * POINTS, a.gradient, b.gradient, 1e-6);
         CHECK_NEAR_ARRAY(BLAS_POINTS, a.values, b.values, 1e-6);

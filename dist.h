@@ -10844,7 +10844,7 @@ typedef struct disti_tile {
     const size_t *list; /* pixels of the rays, which then stand in one row; NULL: a rectangle */
     int x, y, width, height; /* traced: at most DISTI_TILE + 1 each */
     int own_width, own_height; /* written */
-    int lattice; /* pixels between those that are marched before the others are predicted */
+    int lattice; /* pixels between those that are marched before the others are predicted, a power of 2 */
     int cheap, normals; /* 1: queries cost less than bookkeeping; grad f is wanted at hits */
     int lazy; /* 1: only the rays that the cones leave are made; of the others no more is known than that they miss */
 } disti_tile;
@@ -11168,7 +11168,7 @@ typedef struct disti_guess {
 static void disti_guess_off(disti_guess *guess, const disti_ray *before, const disti_ray *behind, int lattice, int at,
                             int beside, int h)
 {
-    int level1 = ((at - h) | beside) % lattice, level2 = ((at + h) | beside) % lattice;
+    int level1 = ((at - h) | beside) & (lattice - 1), level2 = ((at + h) | beside) & (lattice - 1);
     float off1 = before->off, off2 = behind->off;
     if (before->kept || behind->kept) { /* warm: predicted by the last picture, or from next to it */
         level1 = level2 = h;
@@ -11183,44 +11183,42 @@ static void disti_guess_off(disti_guess *guess, const disti_ray *before, const d
 
 /* Prediction along one axis of the picture from the hits at -3 h, -h, h, 3 h. Across an edge, where the hits at -h and
    h are a step apart, it is the farther surface, in case that the ray passes the nearer. */
-static disti_guess disti_predict_axis(const disti_tracer *tracer, const disti_ray *ray, const float *depth, int lattice,
-                                      int at, int beside, int end, int h, int stride)
+static void disti_predict_axis(const disti_tracer *tracer, const disti_ray *ray, const float *depth, int lattice,
+                               int at, int beside, int end, int h, int stride, disti_guess *guess)
 {
-    disti_guess guess;
-    memset(&guess, 0, sizeof guess);
+    memset(guess, 0, sizeof *guess);
     float near = 0.1f * tracer->field->radius;
     float z1 = disti_depth_beside(depth, at, end, -h, stride), z2 = disti_depth_beside(depth, at, end, h, stride);
-    if (!(z1 > 0.0f && z2 > 0.0f)) return guess;
+    if (!(z1 > 0.0f && z2 > 0.0f)) return;
     float a = disti_depth_beside(depth, at, end, -3 * h, stride);
     float b = disti_depth_beside(depth, at, end, 3 * h, stride);
     int near_a = a > 0.0f && a - z1 < near && z1 - a < near, near_b = b > 0.0f && b - z2 < near && z2 - b < near;
     float slope1 = ray[-h * stride].slope, slope2 = ray[h * stride].slope;
     float flatter = DISTI_MAX(slope1, slope2), mean = 0.5f * (slope1 + slope2), gap = z1 < z2 ? z2 - z1 : z1 - z2;
-    if (!(flatter < 0.0f)) return guess;
+    if (!(flatter < 0.0f)) return;
     /* a plane inclined as the slopes say, not a step: |dz| <= tan(angle) times their distance, 2 h pixels */
     float across = 4.0f * (float)h * ray->footprint * DISTI_MAX(z1, z2), tangent = 0.0f;
     if (gap > 1.2f * 0.3f * across)
         tangent = sqrtf(DISTI_MAX(tracer->lipschitz * tracer->lipschitz - mean * mean, 0.0f)) / -mean;
     float inverse = 0.5f * (1.0f / z1 + 1.0f / z2);
-    guess.slope = mean;
-    guess.differ = 3e38f;
-    guess.spread = (flatter - DISTI_MIN(slope1, slope2)) / -mean;
-    guess.quality = flatter <= 0.4f * DISTI_MIN(slope1, slope2) ? 2 : 1;
+    guess->slope = mean;
+    guess->differ = 3e38f;
+    guess->spread = (flatter - DISTI_MIN(slope1, slope2)) / -mean;
+    guess->quality = flatter <= 0.4f * DISTI_MIN(slope1, slope2) ? 2 : 1;
     if (gap > near || gap > 1.2f * (tangent + 0.3f) * across) {
         float z = z1 > z2 ? z1 : z2, beyond = z1 > z2 ? a : b;
         int follows = z1 > z2 ? near_a : near_b;
         inverse = follows ? 1.5f / z - 0.5f / beyond : 1.0f / z;
-        guess.slope = z1 > z2 ? slope1 : slope2;
-        guess.quality = -1;
+        guess->slope = z1 > z2 ? slope1 : slope2;
+        guess->quality = -1;
     } else if (near_a && near_b) {
         float line = 1.0f / inverse;
         inverse = (9.0f / z1 + 9.0f / z2 - 1.0f / a - 1.0f / b) * 0.0625f;
-        guess.sag = line * inverse < 1.0f ? 1.0f / inverse - line : line - 1.0f / inverse;
-        disti_guess_off(&guess, &ray[-h * stride], &ray[h * stride], lattice, at, beside, h);
-        guess.quality += guess.quality == 2;
+        guess->sag = line * inverse < 1.0f ? 1.0f / inverse - line : line - 1.0f / inverse;
+        disti_guess_off(guess, &ray[-h * stride], &ray[h * stride], lattice, at, beside, h);
+        guess->quality += guess->quality == 2;
     }
-    guess.depth = 1.0f / inverse;
-    return guess;
+    guess->depth = 1.0f / inverse;
 }
 
 /* Sets up pixel (x, y) for its first query, half way between pixels at distance h known along x, y or both. 0: it
@@ -11233,10 +11231,10 @@ static int disti_predict(const disti_tracer *tracer, const disti_tile *tile, con
     float *depth = &bench->depth[y * tile->width + x];
     int odd_x = x & h, odd_y = y & h;
     disti_guess guess, other;
-    guess = disti_predict_axis(tracer, ray, depth, tile->lattice, odd_x ? x : y, odd_x ? y : x,
-                               odd_x ? tile->width : tile->height, h, odd_x ? 1 : tile->width);
+    disti_predict_axis(tracer, ray, depth, tile->lattice, odd_x ? x : y, odd_x ? y : x,
+                       odd_x ? tile->width : tile->height, h, odd_x ? 1 : tile->width, &guess);
     if (odd_x && odd_y) {
-        other = disti_predict_axis(tracer, ray, depth, tile->lattice, y, x, tile->height, h, tile->width);
+        disti_predict_axis(tracer, ray, depth, tile->lattice, y, x, tile->height, h, tile->width, &other);
         if (guess.quality > 0 && other.quality > 0) {
             guess.differ = guess.depth < other.depth ? other.depth - guess.depth : guess.depth - other.depth;
             guess.depth = 0.5f * (guess.depth + other.depth);
@@ -11359,7 +11357,7 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
             disti_ray *ray = &bench->rays[i];
             bench->depth[i] = disti_hit_depth(ray); /* of a warm start */
             if (ray->mode == DISTI_DONE) continue;
-            if (x % tile->lattice == 0 && y % tile->lattice == 0) {
+            if (((x | y) & (tile->lattice - 1)) == 0) {
                 bench->index[active++] = i;
                 continue;
             }

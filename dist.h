@@ -151,7 +151,7 @@ typedef struct dist_context_desc {
     dist_scheduler scheduler;
     dist_blas blas;
     dist_logger logger;
-    int blas_width; /* 0: 192; narrower layers were faster without a BLAS wherever that was tried */
+    int blas_width; /* 0: 192; layers of 128 and less were faster without in every run of bench/bench_blas.c */
 } dist_context_desc;
 
 /* desc may be NULL. Returns NULL only if memory cannot be had or half of an allocator is given; any other failure (a
@@ -583,10 +583,10 @@ DIST_API dist_status dist_field_closest_point(dist_context *ctx, const dist_fiel
 
 /* What is empty of a field's bounding sphere, in a grid, for what stands still and is asked often. The rays of
    dist_trace pass what it shows to be empty without a query, and find what they find without it to within the error
-   bounds, but for rays that just touch the surface; a sphere of dist_field_collide that is clear of it by a cell or two
-   asks nothing. Empty is what the field's Lipschitz figures allow no surface in, as for a picture's cones; pictures,
-   whose rays help each other, do without. bench/bench_cache.c prints what it saves: from a third to three quarters of
-   the rays' queries. Belongs to the context that made it. */
+   bounds, but for rays that just touch the surface; a sphere of dist_field_collide asks nothing where the grid shows it
+   to be clear, a small one from a cell or two off the surface on. Empty is what the field's Lipschitz figures allow no
+   surface in, as for a picture's cones; pictures, whose rays help each other, do without. bench/bench_cache.c prints
+   what it saves: from a third to three quarters of the rays' queries. Belongs to the context that made it. */
 typedef struct dist_cache dist_cache;
 /* resolution: cells along each side of the cube around the bounding sphere, a multiple of 8 to 512; 0: 64. That many
    bytes to the third power, and about 8 times its square of queries. NULL on failure. */

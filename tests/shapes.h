@@ -149,6 +149,43 @@ TEST_UNUSED static dist_field shape_field(test_shape *shape, double radius, doub
     return field;
 }
 
+/* One of each kind that tools and games meet. */
+enum { SHAPES = 5 };
+
+TEST_UNUSED static void make_shapes(test_shape shapes[SHAPES])
+{
+    shapes[0] = shape_make(SHAPE_SPHERE, 0.7, 0, 0, 0);
+    shapes[1] = shape_make(SHAPE_TORUS, 0.6, 0.2, 0, 0);
+    shapes[2] = shape_make(SHAPE_BOX, 0.4, 0.5, 0.3, 0);
+    shapes[3] = shape_make(SHAPE_RODS, 0.05, 0, 0, 0);
+    shapes[4] = shape_make(SHAPE_TORUS, 0.6, 0.2, 0, 0);
+    shapes[4].clamp = 0.1;
+}
+
+/* n rays from around the shape through it, and some from near by in any direction. */
+TEST_UNUSED static void make_rays(test_random *random, const test_shape *shape, int n, float *origins,
+                                  float *directions)
+{
+    for (int i = 0; i < n;) {
+        float from[3], to[3], length = test_random_float(random, 0.3f, 3.0f);
+        double p[3];
+        test_random_direction(random, from);
+        test_random_direction(random, to);
+        for (int k = 0; k < 3; k++) {
+            from[k] *= i % 3 ? 2.5f : test_random_float(random, 0.3f, 1.2f);
+            to[k] = i % 3 ? 0.7f * to[k] - from[k] : to[k];
+            p[k] = (double)from[k];
+        }
+        if (shape_value(shape, p) < 0.02) continue; /* in the solid */
+        double size = shape_length((double)to[0], (double)to[1], (double)to[2]);
+        for (int k = 0; k < 3; k++) {
+            origins[3 * i + k] = from[k];
+            directions[3 * i + k] = length * to[k] / (float)size;
+        }
+        i++;
+    }
+}
+
 /* One worker: the counts of a shape are not guarded. */
 TEST_UNUSED static dist_context *shape_context(void)
 {

@@ -5,41 +5,11 @@
 
 #include "model.h"
 
-enum { RAYS = 3000, SHAPES = 5 };
+enum { RAYS = 3000 };
 
 static float origins[3 * RAYS], directions[3 * RAYS], spheres[4 * RAYS];
 static dist_hit plain[RAYS], cached[RAYS];
 static dist_contact contacts[2][RAYS];
-
-static void make_shapes(test_shape shapes[SHAPES])
-{
-    shapes[0] = shape_make(SHAPE_SPHERE, 0.7, 0, 0, 0);
-    shapes[1] = shape_make(SHAPE_TORUS, 0.6, 0.2, 0, 0);
-    shapes[2] = shape_make(SHAPE_BOX, 0.4, 0.5, 0.3, 0);
-    shapes[3] = shape_make(SHAPE_RODS, 0.05, 0, 0, 0);
-    shapes[4] = shape_make(SHAPE_TORUS, 0.6, 0.2, 0, 0);
-    shapes[4].clamp = 0.1;
-}
-
-/* From around the shape, or from near by, outside the solid, in any direction. */
-static void make_rays(test_random *random, const test_shape *shape)
-{
-    for (int i = 0; i < RAYS;) {
-        float from[3], to[3];
-        double p[3];
-        test_random_direction(random, from);
-        test_random_direction(random, to);
-        for (int k = 0; k < 3; k++) {
-            from[k] *= i % 3 ? 2.5f : test_random_float(random, 0.3f, 1.2f);
-            to[k] = i % 3 ? 0.9f * to[k] - from[k] : to[k];
-            p[k] = (double)from[k];
-        }
-        if (shape_value(shape, p) < 0.02) continue;
-        memcpy(origins + 3 * i, from, sizeof from);
-        memcpy(directions + 3 * i, to, sizeof to);
-        i++;
-    }
-}
 
 static double distance_to(const test_shape *shape, const float *p)
 {
@@ -95,7 +65,7 @@ TEST(rays_find_what_they_find_without_a_cache_for_fewer_queries)
             how.certified = mode == 1;
             how.any_hit = mode == 2;
             how.max_distance = mode == 3 ? 0.8f : 0.0f;
-            make_rays(&random, &shapes[k]);
+            make_rays(&random, &shapes[k], RAYS, origins, directions);
             dist_cache *cache = dist_cache_create(ctx, &field, 64);
             dist_field with = dist_cache_field(cache);
             CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, RAYS, origins, directions, &how, plain, &stats[0]), ctx);
@@ -113,7 +83,7 @@ TEST(rays_find_what_they_find_without_a_cache_for_fewer_queries)
             CHECK(differ <= 3); /* that just touch the surface */
             CHECK_EQUAL(0, beyond);
             double share = (double)stats[1].queries / (double)stats[0].queries;
-            CHECK(share < (k == 3 ? 0.8 : shapes[k].clamp > 0 ? 0.85 : 0.65));
+            CHECK(share < (k == 0 ? 0.95 : 0.65)); /* many rays aim at this ball's surface, and graze it */
             if (test_state.verbose)
                 printf("    shape %d, mode %d: %.3f of %llu queries, %d of %d differ\n", k, mode, share,
                        stats[0].queries, differ, RAYS);
@@ -138,7 +108,7 @@ TEST(rays_of_networks_find_what_they_find_without_a_cache)
     test_shape ball = shape_make(SHAPE_SPHERE, 0.65, 0, 0, 0);
     test_random random = test_random_seed(5);
     dist_stats stats[2];
-    make_rays(&random, &ball);
+    make_rays(&random, &ball, RAYS, origins, directions);
     dist_cache *cache = dist_cache_create(ctx, &field, 0);
     dist_field with = dist_cache_field(cache);
     CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, RAYS, origins, directions, NULL, plain, &stats[0]), ctx);

@@ -12,41 +12,6 @@ static dist_hit nearest[RAYS], any[RAYS];
 static unsigned char status[RAYS];
 static dist_contact contacts[RAYS];
 
-enum { SHAPES = 5 };
-
-static void make_shapes(test_shape shapes[SHAPES])
-{
-    shapes[0] = shape_make(SHAPE_SPHERE, 0.7, 0, 0, 0);
-    shapes[1] = shape_make(SHAPE_TORUS, 0.6, 0.2, 0, 0);
-    shapes[2] = shape_make(SHAPE_BOX, 0.4, 0.5, 0.3, 0);
-    shapes[3] = shape_make(SHAPE_RODS, 0.05, 0, 0, 0);
-    shapes[4] = shape_make(SHAPE_TORUS, 0.6, 0.2, 0, 0);
-    shapes[4].clamp = 0.1;
-}
-
-/* From around the shape through it, and some from near by in any direction. */
-static void make_rays(test_random *random, const test_shape *shape)
-{
-    for (int i = 0; i < RAYS;) {
-        float from[3], to[3], length = test_random_float(random, 0.3f, 3.0f);
-        double p[3];
-        test_random_direction(random, from);
-        test_random_direction(random, to);
-        for (int k = 0; k < 3; k++) {
-            from[k] *= i % 3 ? 2.5f : test_random_float(random, 0.3f, 1.2f);
-            to[k] = i % 3 ? 0.7f * to[k] - from[k] : to[k];
-            p[k] = (double)from[k];
-        }
-        if (shape_value(shape, p) < 0.02) continue; /* in the solid */
-        double size = shape_length((double)to[0], (double)to[1], (double)to[2]);
-        for (int k = 0; k < 3; k++) {
-            origins[3 * i + k] = from[k];
-            directions[3 * i + k] = length * to[k] / (float)size;
-        }
-        i++;
-    }
-}
-
 static int blocked(const dist_hit *hit)
 {
     return hit->status == DIST_RAY_HIT;
@@ -64,7 +29,7 @@ TEST(any_hit_finds_a_blocker_where_there_is_one_for_fewer_queries)
         dist_stats first, second;
         int differ = 0, hits = 0, outside = 0, before = 0;
         memset(&how, 0, sizeof how);
-        make_rays(&random, &shapes[k]);
+        make_rays(&random, &shapes[k], RAYS, origins, directions);
         CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, RAYS, origins, directions, &how, nearest, &first), ctx);
         how.any_hit = 1;
         CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, RAYS, origins, directions, &how, any, &second), ctx);
@@ -103,7 +68,7 @@ TEST(a_ray_looks_as_far_as_it_is_told_in_lengths_of_its_direction)
         dist_render_desc how;
         dist_stats first, second;
         memset(&how, 0, sizeof how);
-        make_rays(&random, &shapes[k]);
+        make_rays(&random, &shapes[k], RAYS, origins, directions);
         CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, RAYS, origins, directions, &how, nearest, &first), ctx);
         for (int both = 0; both < 2; both++) {
             int wrong = 0, cut = 0, hits = 0;

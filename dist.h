@@ -954,6 +954,17 @@ DIST_API const char *dist_version(void)
     return "0.2.0";
 }
 
+/* x as memory holds it: the x87's registers hold more, by which a value may be less or more than itself. */
+#if defined(__FLT_EVAL_METHOD__) && __FLT_EVAL_METHOD__ != 0 && __FLT_EVAL_METHOD__ != 16
+static float disti_float(float x)
+{
+    volatile float kept = x;
+    return kept;
+}
+#else
+#define disti_float(x) (x)
+#endif
+
 /* Looks at the bits: -ffast-math removes a test of the value. */
 static int disti_finite(float x)
 {
@@ -4347,7 +4358,8 @@ static unsigned char *disti_scene_scratch(const dist_scene *scene, int worker)
 
 static float disti_ball_distance(const disti_ball *ball, const float *p)
 {
-    return disti_length(p[0] - ball->center[0], p[1] - ball->center[1], p[2] - ball->center[2]) - ball->radius;
+    float length = disti_length(p[0] - ball->center[0], p[1] - ball->center[1], p[2] - ball->center[2]);
+    return disti_float(disti_float(length) - ball->radius);
 }
 
 /* What is asked for p: q, or where the bounding sphere is nearest to it if it lies outside. */
@@ -4385,10 +4397,10 @@ static float disti_placed_gradient(const disti_placed *placed, const disti_ball 
         along += n[i] * gradient[i];
     }
     if (!disti_finite(value)) return value;
-    float b = d > 0.0f ? sqrtf(d * d + v * v) : placed->scale * f;
-    if (b > value) {
+    float b = d > 0.0f ? sqrtf(d * d + v * v) : placed->scale * f, beside = d - ball->margin;
+    if (b > ball->margin + fabsf(beside)) {
         *weight = 0.0f;
-        for (int i = 0; i < 3; i++) gradient[i] = d > ball->margin ? n[i] : -n[i];
+        for (int i = 0; i < 3; i++) gradient[i] = beside > 0.0f ? n[i] : -n[i];
     } else if (d > 0.0f) {
         *weight *= v / b;
         for (int i = 0; i < 3; i++)
@@ -4425,7 +4437,7 @@ static int disti_scene_begin(const dist_scene *scene, const float *p, disti_scen
         float x = p[0] - ball->center[0], y = p[1] - ball->center[1], z = p[2] - ball->center[2];
         float square = x * x + y * y + z * z, reach = limit + ball->radius;
         if (square >= reach * reach || k == hint) continue;
-        float d = sqrtf(square) - ball->radius, m = ball->margin;
+        float d = disti_float(disti_float(sqrtf(square)) - ball->radius), m = ball->margin;
         if (d >= m) {
             if (d >= best) continue;
             best = d;

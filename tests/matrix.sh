@@ -139,6 +139,11 @@ else
     done
 fi
 
+if can gcc -mfpmath=387 -fexcess-precision=fast; then # registers that hold more than a float, as 32-bit x86 without SSE has
+    row x87 build/matrix/x87 gcc "-O2 -mfpmath=387 -fexcess-precision=fast" "" 1 "" ${quick:+test_scene test_camera test_tools}
+else
+    skip_row x87 "gcc -mfpmath=387 does not work here"
+fi
 if have aarch64-linux-gnu-gcc && have qemu-aarch64; then
     # All of it takes an emulator too long for every change.
     row aarch64 build/matrix/aarch64 aarch64-linux-gnu-gcc "-O2 -static" "" 1 qemu-aarch64 \

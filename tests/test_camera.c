@@ -314,7 +314,7 @@ TEST(move_is_the_exponential)
                 for (int m = 0; m < 3; m++) expected += e[3 * i + m] * (double)before.rotation[3 * m + j];
                 CHECK_NEAR(expected, c.rotation[3 * i + j], 3e-7);
             }
-            CHECK_NEAR(before.translation[i] + t[i], c.translation[i], 0);
+            CHECK_NEAR((double)before.translation[i] + (double)t[i], c.translation[i], 2.4e-7);
         }
     }
 }

@@ -3509,8 +3509,8 @@ static float disti_spans_farthest(const float *from, const float *to, int n, flo
 #ifdef DISTI_X86
     __m128 ends = _mm_set1_ps(end), none = _mm_set1_ps(3e38f), mosts = ends, leasts = none;
     for (; k < n; k += 4) {
-        __m128 a = _mm_loadu_ps(from + k), b = _mm_loadu_ps(to + k), joins = _mm_cmple_ps(a, ends);
-        mosts = _mm_max_ps(mosts, _mm_or_ps(_mm_and_ps(joins, b), _mm_andnot_ps(joins, ends)));
+        __m128 a = _mm_loadu_ps(from + k), b = _mm_loadu_ps(to + k), joins = _mm_cmple_ps(a, mosts);
+        mosts = _mm_max_ps(mosts, _mm_or_ps(_mm_and_ps(joins, b), _mm_andnot_ps(joins, mosts)));
         leasts = _mm_min_ps(leasts, _mm_or_ps(_mm_and_ps(joins, none), _mm_andnot_ps(joins, a)));
     }
     mosts = _mm_max_ps(mosts, _mm_movehl_ps(mosts, mosts));
@@ -3808,7 +3808,7 @@ static dist_status disti_field_check(dist_context *ctx, const dist_field *field,
         return disti_refuse(ctx, "%s: field.eval_fn is NULL (a failed create, or a net without a distance channel)",
                             function);
     /* beyond these squares of lengths do not fit a float, and a surface would be missed without a word */
-    if (!(field->radius >= DISTI_RADIUS_LEAST) || !(field->radius <= DISTI_RADIUS_MOST))
+    if (!disti_finite(field->radius) || field->radius < DISTI_RADIUS_LEAST || field->radius > DISTI_RADIUS_MOST)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.radius is %d, must be 1e-15 to 1e15", function,
                           (double)field->radius, 0);
     for (int i = 0; i < 3; i++)
@@ -6545,6 +6545,7 @@ static const float *disti_few_forward(const dist_shape *shape, disti_block *b, d
             for (size_t c = 0; c < points; c++) *mask |= (uint64_t)(x[c * width + (size_t)list[i]] > 0.0f) << c;
         }
         for (int i = 0; i < layer->point; i++, count++) {
+            b->mask[(size_t)l * width + (size_t)(layer->prev + i)] = ~(uint64_t)0;
             list[count] = layer->prev + i;
             for (size_t c = 0; c < points; c++) x[c * width + (size_t)list[count]] = b->point[i * DISTI_BLOCK + (int)c];
         }
@@ -9270,18 +9271,21 @@ static int disti_ray_bracketed(const disti_tracer *tracer, disti_ray *ray, float
 {
     float tolerance = 0.25f * disti_ray_epsilon(tracer, ray, ray->q);
     float slope_a = (ray->fa - f) / (ray->q - ray->a), slope_b = (f - ray->fb) / (ray->b - ray->q);
-    int inside = f <= 0.0f;
+    int inside = f <= 0.0f, apart = ray->q > ray->a && ray->q < ray->b; /* of an end at q there is no slope */
     float slope = inside ? slope_a : slope_b;
     float other = inside ? slope_b : slope_a;
     float magnitude = f < 0.0f ? -f : f;
     float aside = other > 0.0f ? other : -other, flatter = DISTI_MIN(slope, aside);
-    if (slope > 1e-3f && magnitude <= tolerance * DISTI_MIN(0.5f * slope, flatter)) {
+    if (apart && slope > 1e-3f && magnitude <= tolerance * DISTI_MIN(0.5f * slope, flatter)) {
         ray->slope = -slope;
-        float width = ray->b - ray->a, off = magnitude * (DISTI_MAX(slope, aside) / flatter) + tracer->noise;
-        if (disti_coarse(tracer, 4.0f * tolerance)) off += off;
-        float error = disti_ray_kink(tracer, ray, flatter);
-        return disti_ray_end(ray, DIST_RAY_HIT, ray->q + f / slope, 0.0f,
-                             DISTI_MAX(error, off < width * flatter ? off / flatter : width));
+        float width = ray->b - ray->a, error = width;
+        if (flatter > 0.0f && disti_finite(slope + aside)) {
+            float off = magnitude * (DISTI_MAX(slope, aside) / flatter) + tracer->noise;
+            if (disti_coarse(tracer, 4.0f * tolerance)) off += off;
+            if (off < width * flatter) error = off / flatter;
+        }
+        error = DISTI_MAX(error, disti_ray_kink(tracer, ray, flatter));
+        return disti_ray_end(ray, DIST_RAY_HIT, ray->q + f / slope, 0.0f, error);
     }
     if (inside) {
         ray->b = ray->q;
@@ -15522,7 +15526,7 @@ static int disti_mesh_read_vertex(disti_mesh_text *r, const double v[3])
 /* Corner number k of a polygon. A polygon of one or two corners adds nothing. */
 static int disti_mesh_read_corner(disti_mesh_text *r, size_t k, double index)
 {
-    if (!(index >= 0.0 && index < 4294967295.0) || index != (double)(unsigned)index)
+    if (!disti_finite_double(index) || index < 0.0 || index >= 4294967295.0 || index != (double)(unsigned)index)
         return disti_mesh_fail(r, DIST_BAD_FILE, "a face has vertex %d, which is out of range", index);
     unsigned corner = (unsigned)index;
     if (k == 0) r->first = corner;

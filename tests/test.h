@@ -373,6 +373,14 @@ TEST_UNUSED static dist_allocator test_allocator_hook(test_allocator *a)
 
 /* Hands out tasks last first and a different worker each time, so that what depends on order or worker shows itself.
    Set workers, and the same in the context's desc. */
+/* Fills what the context's workers work in: no result may depend on what an earlier call has left there. */
+TEST_UNUSED static void test_soil(dist_context *ctx, int byte)
+{
+    memset(ctx->scratch, byte, (size_t)ctx->workers * DISTI_SCRATCH_BYTES);
+    if (ctx->lanes) memset(ctx->lanes, byte, (size_t)ctx->workers * ctx->lane_bytes);
+    if (ctx->partial) memset(ctx->partial, byte, DISTI_SLOTS * ctx->partial_size * sizeof(double));
+}
+
 typedef struct test_scheduler {
     int workers;
     int calls;

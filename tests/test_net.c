@@ -507,8 +507,10 @@ TEST(a_few_points_have_the_bits_of_many)
         field.eval_fn(field.user, 0, MANY, points, many, slopes);
         for (int n = 1; n <= MANY; n++) {
             for (int at = 0; at + n <= MANY; at += n) {
+                test_soil(ctx, 0);
                 field.eval_fn(field.user, 0, (size_t)n, points + 3 * at, few, NULL);
                 CHECK_BYTES((size_t)n * sizeof(float), many + at, few);
+                test_soil(ctx, n & 1 ? 0 : 0xff);
                 field.eval_fn(field.user, 0, (size_t)n, points + 3 * at, few, slope);
                 CHECK_BYTES((size_t)n * sizeof(float), many + at, few);
                 CHECK_BYTES(3 * (size_t)n * sizeof(float), slopes + 3 * at, slope);

@@ -2,7 +2,7 @@
    Random scenes, from ordinary to absurd, through render and backward: fields, nets of all kinds with weights up to
    extreme, textures, weights in 16 bits, scenes of instances, cameras, settings, tapes that start warm, sizes. Whatever
    comes, nothing that is not finite is written, no budget is exceeded, every status is true, what is not finite is
-   refused where it comes in, and one worker and three give the same bits.
+   refused where it comes in, and one worker and three give the same bits, whatever was left in their memory.
 
        build/test_torture            300 scenes; DIST_TEST_QUICK=1: 60
        DIST_TORTURE=20000 build/test_torture    that many, and a csv line for each check (make torture)
@@ -647,6 +647,7 @@ static int scene_render(const scene *s, stage *where, planes *p, pulls *g, scene
     dist_images out;
     dist_camera camera = s->camera;
     dist_render_desc how = s->how;
+    int soil = where == &stages[0] ? 0 : 0xff;
     memset(g, 0, sizeof *g);
     dist_context_clear(ctx);
     make_field(ctx, s, own, &m);
@@ -663,6 +664,7 @@ static int scene_render(const scene *s, stage *where, planes *p, pulls *g, scene
         if (m.shape) dist_shape_set_code(m.shape, code);
         own->code[0] = s->own.code[0] + 1e-3f * (float)k * (float)s->radius;
         out = planes_of(p, s->planes, m.placed.color_fn != NULL);
+        test_soil(ctx, soil);
         dist_render(ctx, &m.placed, &before, &how, &out, tape);
     }
     if (s->warm && m.shape && dist_context_status(ctx) == DIST_OK) {
@@ -673,8 +675,10 @@ static int scene_render(const scene *s, stage *where, planes *p, pulls *g, scene
     own->code[0] = s->own.code[0];
     own->points = 0;
     out = planes_of(p, s->planes, m.placed.color_fn != NULL);
+    test_soil(ctx, soil);
     dist_status status = dist_render(ctx, &m.placed, &camera, &how, &out, tape);
     if (status == DIST_OK) status = dist_context_status(ctx); /* a warm picture may be refused */
+    test_soil(ctx, soil);
     if (status == DIST_OK && tape) status = scene_backward(s, ctx, &m.placed, tape, &out, g);
     if (where->memory.requests != requests) note(MEMORY, "requests", (double)requests, (double)where->memory.requests);
     if (status != DIST_OK && !strstr(dist_context_message(ctx), ": ")) note(REFUSED, "status", status, 0);

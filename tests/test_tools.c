@@ -678,6 +678,7 @@ TEST(many_points_are_the_same_as_single_ones)
     CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &field, N, points, closest, distance, status), ctx);
     for (int i = 0; i < N; i += 37) {
         float d;
+        test_soil(ctx, i & 1 ? 0 : 0xff);
         CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &field, 1, points + 3 * i, alone, &d, NULL), ctx);
         CHECK_BYTES(sizeof alone, closest + 3 * i, alone);
         CHECK_BYTES(sizeof d, distance + i, &d);

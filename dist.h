@@ -3509,8 +3509,8 @@ static float disti_spans_farthest(const float *from, const float *to, int n, flo
 #ifdef DISTI_X86
     __m128 ends = _mm_set1_ps(end), none = _mm_set1_ps(3e38f), mosts = ends, leasts = none;
     for (; k < n; k += 4) {
-        __m128 a = _mm_loadu_ps(from + k), b = _mm_loadu_ps(to + k), joins = _mm_cmple_ps(a, mosts);
-        mosts = _mm_max_ps(mosts, _mm_or_ps(_mm_and_ps(joins, b), _mm_andnot_ps(joins, mosts)));
+        __m128 a = _mm_loadu_ps(from + k), b = _mm_loadu_ps(to + k), joins = _mm_cmple_ps(a, ends);
+        mosts = _mm_max_ps(mosts, _mm_or_ps(_mm_and_ps(joins, b), _mm_andnot_ps(joins, ends)));
         leasts = _mm_min_ps(leasts, _mm_or_ps(_mm_and_ps(joins, none), _mm_andnot_ps(joins, a)));
     }
     mosts = _mm_max_ps(mosts, _mm_movehl_ps(mosts, mosts));

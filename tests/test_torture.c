@@ -12,6 +12,7 @@
 #include "shapes.h"
 
 enum { MOST = 14400, SMALL = 2048 }; /* pixels of a scene, and of most */
+enum { LEFT_MOST = 130 };             /* points */
 
 typedef struct planes {
     float depth[MOST], distance[MOST], normal[3 * MOST], silhouette[MOST], color[3 * MOST], error[MOST];
@@ -966,6 +967,80 @@ TEST(random_scenes_keep_their_word)
     }
 }
 
+/* What the functions without a picture give for a net's field and n points, rays and spheres. */
+typedef struct answers {
+    float sdf[LEFT_MOST], gradient[3 * LEFT_MOST], d_points[3 * LEFT_MOST], closest[3 * LEFT_MOST], distance[LEFT_MOST];
+    float d_code[MODEL_CODE];
+    dist_hit hits[LEFT_MOST];
+    dist_contact contacts[LEFT_MOST];
+    unsigned char status[LEFT_MOST];
+    size_t vertices;
+    float vertex[3 * LEFT_MOST];
+} answers;
+
+static void answers_of(dist_context *ctx, const dist_field *field, size_t n, int soil, const float *points,
+                       const float *directions, float *spheres, answers *a)
+{
+    dist_gradients grads;
+    dist_mesh_desc desc;
+    memset(a, 0, sizeof *a);
+    memset(&grads, 0, sizeof grads);
+    memset(&desc, 0, sizeof desc);
+    if (field->code_size > 0) grads.code = a->d_code;
+    test_soil(ctx, soil);
+    dist_field_eval(ctx, field, n, points, a->sdf, a->gradient);
+    test_soil(ctx, soil);
+    dist_field_backward(ctx, field, n, points, spheres, NULL, NULL, a->d_points, &grads);
+    test_soil(ctx, soil);
+    dist_field_closest_point(ctx, field, n, points, a->closest, a->distance, a->status);
+    test_soil(ctx, soil);
+    dist_field_collide(ctx, field, n, spheres, a->contacts);
+    test_soil(ctx, soil);
+    dist_trace(ctx, field, n, points, directions, NULL, a->hits, NULL);
+    if (n > 1) return;
+    desc.resolution = 12;
+    desc.normals = 1;
+    desc.refine = 1;
+    test_soil(ctx, soil);
+    dist_mesh *mesh = dist_mesh_extract(ctx, field, &desc);
+    if (!mesh) return;
+    a->vertices = mesh->vertex_count;
+    size_t kept = mesh->vertex_count < LEFT_MOST ? mesh->vertex_count : LEFT_MOST;
+    if (kept > 0) memcpy(a->vertex, mesh->vertices, 3 * kept * sizeof(float));
+    dist_mesh_destroy(mesh);
+}
+
+/* Found by scene 323: gradients of a few points were masked by what the worker's memory held. */
+TEST(nothing_depends_on_what_was_left_in_memory)
+{
+    static const size_t counts[] = {1, 3, 8, 12, 47, LEFT_MOST};
+    static answers with[2];
+    static float points[3 * LEFT_MOST], directions[3 * LEFT_MOST], spheres[4 * LEFT_MOST];
+    dist_context *ctx = test_context();
+    test_random random = test_random_seed(17);
+    test_random_fill(&random, 3 * LEFT_MOST, points, -0.9f, 0.9f);
+    test_random_fill(&random, 3 * LEFT_MOST, directions, -1, 1);
+    test_random_fill(&random, 4 * LEFT_MOST, spheres, 0.1f, 0.5f);
+    for (int k = 0; k < MODEL_CASES; k++) {
+        model m = model_make(&model_cases[k], 3);
+        dist_net *net = model_load(ctx, &m);
+        dist_shape *shape = dist_shape_create(ctx, net, NULL);
+        dist_field field = dist_shape_field(shape);
+        for (size_t i = 0; field.eval_fn && i < sizeof counts / sizeof counts[0]; i++) {
+            for (int j = 0; j < 2; j++)
+                answers_of(ctx, &field, counts[i], j ? 0xff : 0, points, directions, spheres, &with[j]);
+            if (!CHECK(memcmp(&with[0], &with[1], sizeof with[0]) == 0))
+                printf("    %s, %d points\n", model_cases[k].name, (int)counts[i]);
+        }
+        CHECK_STATUS(DIST_OK, dist_context_status(ctx), ctx);
+        dist_context_clear(ctx);
+        dist_shape_destroy(shape);
+        dist_net_destroy(net);
+        model_free(&m);
+    }
+    dist_context_destroy(ctx);
+}
+
 /* Found by scene 988: idle lanes of a block that is not full held another block's units, and these counted as alive. */
 TEST(operations_do_not_depend_on_what_came_before)
 {
@@ -1074,6 +1149,7 @@ int main(int argc, char **argv)
     test_begin(argc, argv);
     RUN(papers_tracer_reports_any_sample_that_is_not_finite);
     RUN(warm_hits_owe_their_normals_and_colors);
+    RUN(nothing_depends_on_what_was_left_in_memory);
     RUN(operations_do_not_depend_on_what_came_before);
     RUN(random_scenes_keep_their_word);
     return test_report();

@@ -955,15 +955,15 @@ DIST_API const char *dist_version(void)
 }
 
 /* x as memory holds it: the x87's registers hold more, by which a value may be less or more than itself. */
-#if defined(__FLT_EVAL_METHOD__) && __FLT_EVAL_METHOD__ != 0 && __FLT_EVAL_METHOD__ != 16
 static float disti_float(float x)
 {
+#if defined(__FLT_EVAL_METHOD__) && __FLT_EVAL_METHOD__ != 0 && __FLT_EVAL_METHOD__ != 16 /* 16: half floats are */
     volatile float kept = x;
     return kept;
-}
 #else
-#define disti_float(x) (x)
+    return x;
 #endif
+}
 
 /* Looks at the bits: -ffast-math removes a test of the value. */
 static int disti_finite(float x)

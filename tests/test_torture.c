@@ -1014,7 +1014,7 @@ static void answers_of(dist_context *ctx, const dist_field *field, size_t n, int
 TEST(nothing_depends_on_what_was_left_in_memory)
 {
     static const size_t counts[] = {1, 3, 8, 12, 47, LEFT_MOST};
-    static answers with[2];
+    static answers both[2];
     static float points[3 * LEFT_MOST], directions[3 * LEFT_MOST], spheres[4 * LEFT_MOST];
     dist_context *ctx = test_context();
     test_random random = test_random_seed(17);
@@ -1028,8 +1028,8 @@ TEST(nothing_depends_on_what_was_left_in_memory)
         dist_field field = dist_shape_field(shape);
         for (size_t i = 0; field.eval_fn && i < sizeof counts / sizeof counts[0]; i++) {
             for (int j = 0; j < 2; j++)
-                answers_of(ctx, &field, counts[i], j ? 0xff : 0, points, directions, spheres, &with[j]);
-            if (!CHECK(memcmp(&with[0], &with[1], sizeof with[0]) == 0))
+                answers_of(ctx, &field, counts[i], j ? 0xff : 0, points, directions, spheres, &both[j]);
+            if (!CHECK(memcmp(&both[0], &both[1], sizeof both[0]) == 0))
                 printf("    %s, %d points\n", model_cases[k].name, (int)counts[i]);
         }
         CHECK_STATUS(DIST_OK, dist_context_status(ctx), ctx);

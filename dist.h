@@ -15526,7 +15526,7 @@ static int disti_mesh_read_vertex(disti_mesh_text *r, const double v[3])
 /* Corner number k of a polygon. A polygon of one or two corners adds nothing. */
 static int disti_mesh_read_corner(disti_mesh_text *r, size_t k, double index)
 {
-    if (!disti_finite_double(index) || index < 0.0 || index >= 4294967295.0 || index != (double)(unsigned)index)
+    if (!(index >= 0.0 && index < 4294967295.0) || index != (double)(unsigned)index)
         return disti_mesh_fail(r, DIST_BAD_FILE, "a face has vertex %d, which is out of range", index);
     unsigned corner = (unsigned)index;
     if (k == 0) r->first = corner;

@@ -369,10 +369,6 @@ TEST_UNUSED static dist_allocator test_allocator_hook(test_allocator *a)
     return hook;
 }
 
-/* ---- a scheduler without threads --------------------------------------------------------------------------------- */
-
-/* Hands out tasks last first and a different worker each time, so that what depends on order or worker shows itself.
-   Set workers, and the same in the context's desc. */
 /* Fills what the context's workers work in: no result may depend on what an earlier call has left there. */
 TEST_UNUSED static void test_soil(dist_context *ctx, int byte)
 {
@@ -381,6 +377,10 @@ TEST_UNUSED static void test_soil(dist_context *ctx, int byte)
     if (ctx->partial) memset(ctx->partial, byte, DISTI_SLOTS * ctx->partial_size * sizeof(double));
 }
 
+/* ---- a scheduler without threads --------------------------------------------------------------------------------- */
+
+/* Hands out tasks last first and a different worker each time, so that what depends on order or worker shows itself.
+   Set workers, and the same in the context's desc. */
 typedef struct test_scheduler {
     int workers;
     int calls;

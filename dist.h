@@ -4997,9 +4997,8 @@ DIST_API void dist_similarity_move(dist_similarity *placement, const float step[
     if (placement->scale == 0.0f) placement->scale = 1.0f;
     if (memcmp(placement->rotation, zero, sizeof zero) == 0)
         placement->rotation[0] = placement->rotation[4] = placement->rotation[8] = 1.0f;
-    placement->scale *= expf(step[0]);
-    if (placement->scale < 1e-30f) placement->scale = 1e-30f;
-    if (placement->scale > 1e30f) placement->scale = 1e30f;
+    double scale = (double)placement->scale * exp((double)step[0]);
+    placement->scale = (float)(scale < 1e-30 ? 1e-30 : scale > 1e30 ? 1e30 : scale);
     disti_turn(step + 1, placement->rotation);
     for (int i = 0; i < 3; i++) placement->translation[i] += step[4 + i];
 }
@@ -7774,7 +7773,7 @@ DIST_API dist_status dist_shape_set_texture(dist_shape *shape, const dist_net *t
     if (texture) {
         size_t own = (size_t)shape->net->code_size, size = (size_t)texture->code_size;
         paint = dist_shape_create(ctx, texture, NULL);
-        if (!paint) return ctx->status;
+        if (!paint) return DIST_OUT_OF_MEMORY;
         memcpy(paint->code, shape->code, own * sizeof(float));
         status = disti_code_copy(ctx, name, size - own, color_code, paint->code + own);
         disti_shape_fold(paint);
@@ -8212,7 +8211,7 @@ static dist_status disti_loader_channels(disti_loader *loader)
         if (n == 0 || n >= sizeof net->channel_names[0]) break;
         memcpy(net->channel_names[net->channels], s, n);
         if (n == 3 && memcmp(s, "sdf", 3) == 0 && net->sdf_channel < 0) net->sdf_channel = net->channels;
-        if (n == 1 && s[0] == 'r' && memcmp(s, "r,g,b", 5) == 0 && (s[5] == 0 || s[5] == ','))
+        if (n == 1 && strncmp(s, "r,g,b", 5) == 0 && (s[5] == 0 || s[5] == ','))
             net->color_channel = net->channels;
         net->channels++;
         s += n;

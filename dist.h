@@ -11418,7 +11418,7 @@ static void disti_trace_doubt(const disti_tracer *tracer, const disti_tile *tile
         float z = *depth, doubt = 0.0f;
         if (!(z > 0.0f)) continue;
         disti_ray *ray = &bench->rays[i];
-        float falls = ray->slope < 0.0f ? -ray->slope : ray->slope;
+        float falls = fabsf(ray->slope);
         if (falls < 0.06f * tracer->lipschitz && ray->sign > 0.0f) {
             float flat = 8.0f * DISTI_MAX(disti_ray_epsilon(tracer, ray, ray->best), disti_default_epsilon(tracer));
             ray->error = DISTI_MAX(ray->error, flat < farthest * falls ? flat / falls : farthest);
@@ -11430,7 +11430,7 @@ static void disti_trace_doubt(const disti_tracer *tracer, const disti_tile *tile
             float z2 = disti_depth_beside(depth, at, end, 1, stride);
             if (!(z1 > 0.0f && z2 > 0.0f)) continue;
             float fall1 = z - z1, fall2 = z - z2, pixel = 2.0f * ray->footprint * z;
-            float size1 = fall1 < 0.0f ? -fall1 : fall1, size2 = fall2 < 0.0f ? -fall2 : fall2;
+            float size1 = fabsf(fall1), size2 = fabsf(fall2);
             if (DISTI_MAX(size1, size2) > 2.0f * DISTI_MIN(size1, size2) + pixel ||
                 DISTI_MIN(fall1, fall2) > 2.0f * pixel) {
                 float fall = size1 > size2 ? fall1 : fall2;
@@ -11441,7 +11441,7 @@ static void disti_trace_doubt(const disti_tracer *tracer, const disti_tile *tile
             float off = 0.5f * (fall1 + fall2), cubic = off;
             if (!(ray->off > 0.0f)) continue;
             if (a > 0.0f && b > 0.0f) cubic = (4.0f * (fall1 + fall2) + a + b - z - z) / 6.0f;
-            off = DISTI_MIN(off < 0.0f ? -off : off, cubic < 0.0f ? -cubic : cubic);
+            off = DISTI_MIN(fabsf(off), fabsf(cubic));
             doubt = DISTI_MAX(doubt, 1.5f * off);
         }
         ray->error = DISTI_MAX(ray->error, doubt / ray->cosine);
@@ -11935,8 +11935,8 @@ struct dist_tape {
     size_t bytes;
 };
 
-/* counts as a hit; has a sample of smallest |f|; misses by less than how.relax_band */
-enum { DISTI_TAPE_HIT = 16, DISTI_TAPE_SAMPLE = 32, DISTI_TAPE_NEAR = 64 };
+/* counts as a hit; has a sample of smallest |f|; misses by less than how.relax_band; no hit, but that sample's f < 0 */
+enum { DISTI_TAPE_HIT = 16, DISTI_TAPE_SAMPLE = 32, DISTI_TAPE_NEAR = 64, DISTI_TAPE_SOLID = 128 };
 
 /* The most cones that do not fall apart in a tile of this size, blocks of 8 pixels or larger, and one of size 0; those
    of a picture, whatever its tiles. */
@@ -12258,13 +12258,15 @@ static void disti_render_pixel(const disti_render_job *job, const disti_ray *ray
     if (out->color) memcpy(out->color + 3 * pixel, tracer->how.background_color, 3 * sizeof(float));
     if (!job->tape) return;
     int sampled = ray->enter < ray->leave && ray->fbest < 2e38f && ray->status != DIST_RAY_NOT_FINITE;
+    float least = job->tape->sample ? job->tape->sample[pixel * (size_t)job->tape->samples * 4] : ray->fbest;
     job->tape->s[pixel] = ray->best;
     job->tape->status[pixel] = (unsigned char)(ray->status | (ray->status == DIST_RAY_HIT ? DISTI_TAPE_HIT : 0) |
                                                (sampled ? DISTI_TAPE_SAMPLE : 0) |
                                                (sampled && ray->status == DIST_RAY_MISS && ray->fbest > 0.0f &&
                                                         ray->fbest < job->tracer->how.relax_band
                                                     ? DISTI_TAPE_NEAR
-                                                    : 0));
+                                                    : 0) |
+                                               (sampled && !hit && least < 0.0f ? DISTI_TAPE_SOLID : 0));
     if (!job->tape->value) return;
     if (!ray->kept) job->tape->beside[pixel] = 0.0f;
     job->tape->start[pixel] = ray->kept ? DISTI_MIN(job->tape->start[pixel], ray->stop) : ray->stop;
@@ -13528,6 +13530,7 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
               |f| > 0.1: the seed alpha d_t at each p_k. The residual e of eq. (4) is dropped, and K samples are
               summed, not averaged: the paper's approximation, in the scale of its authors' code.      (paper, 3.4)
    silhouette S = f(p_min) - epsilon: the seed d_S at the sample of smallest |f|                    (envelope theorem)
+              no hit, yet f(p_min) < 0, as where the ray starts in the solid: S = -f(p_min) - epsilon, so the seed -d_S.
               off the sphere S = |o| - radius with o the ray's point nearest to it: y = d_S o / |o|.
    normal's   n = G / |G|: u = (d_n - n (n . d_n)) / |G| pulls on G, and s = u . G with u held has the rest: the field
               receives ds of it, the hit y = H u and, but in the paper's mode, d_t += y . v. Exact where f is smooth
@@ -13741,6 +13744,7 @@ static void disti_backward_pixel(disti_render_backward_job *job, size_t pixel, f
         return;
     }
     if (!(status & DISTI_TAPE_SAMPLE)) d_silhouette = 0.0f;
+    if (status & DISTI_TAPE_SOLID) d_silhouette = -d_silhouette;
     d_distance += d_depth * (float)local[2];
     if (paper) { /* the tilt's share, which in the other modes goes with the hit's entry */
         for (int i = 0; i < 3; i++) nearest[i] = (double)p[i], pull[i] = 0.0;

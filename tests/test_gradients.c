@@ -937,6 +937,44 @@ TEST(silhouette_backward_off_the_sphere_moves_only_the_camera)
 }
 
 /* A wide lens that looks past the sphere: of most rays the camera itself is the point nearest to it. */
+/* Neither a hit nor off the sphere: the ray starts in the solid, so S = -f - epsilon where f is nearest to 0. */
+TEST(silhouette_backward_of_rays_that_start_inside_matches_differences)
+{
+    enum { SIDE = 5, ALL = SIDE * SIDE };
+    const float eye[3] = {0.1f, 0.05f, -0.2f}, at[3] = {0, 0, 1}, up[3] = {0, 1, 0};
+    float silhouette[ALL], ones[ALL], ball[4] = {0, 0, 0, 0}, d_ball[4] = {0, 0, 0, 0};
+    unsigned char status[ALL];
+    double sum[2] = {0, 0}, h = 2e-3;
+    dist_images out, d_out;
+    dist_gradients grads;
+    dist_context *ctx = test_context();
+    dist_camera camera = dist_camera_look_at(SIDE, SIDE, 0.7f, eye, at, up);
+    dist_tape *tape = dist_tape_create(ctx, &camera, NULL);
+    memset(&out, 0, sizeof out);
+    memset(&d_out, 0, sizeof d_out);
+    memset(&grads, 0, sizeof grads);
+    out.silhouette = silhouette;
+    out.status = status;
+    d_out.silhouette = ones;
+    grads.code = d_ball;
+    for (int k = 0; k < 3; k++) { /* the last one is what the tape keeps */
+        ball[3] = 0.8f + (float)(k == 0 ? -h : k == 1 ? h : 0);
+        dist_field field = dist_field_sphere(ball);
+        field.radius = 1.0f;
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, tape), ctx);
+        for (int i = 0; i < ALL; i++) {
+            ones[i] = 1.0f;
+            CHECK_EQUAL(DIST_RAY_INSIDE, status[i]);
+            if (k < 2) { sum[k] += (double)silhouette[i]; }
+        }
+    }
+    CHECK_STATUS(DIST_OK, dist_render_backward(ctx, tape, &d_out, &grads), ctx);
+    CHECK_NEAR((sum[1] - sum[0]) / (2 * h), (double)d_ball[3], 0.01 * ALL);
+    CHECK_NEAR(ALL, (double)d_ball[3], 0.01 * ALL); /* |f| there is the radius less the eye's distance */
+    dist_tape_destroy(tape);
+    dist_context_destroy(ctx);
+}
+
 TEST(silhouette_backward_with_the_sphere_behind_the_camera_matches_differences)
 {
     scene s;
@@ -1227,7 +1265,7 @@ TEST(paper_mode_after_the_papers_tracer_is_alpha_df_summed_over_the_samples)
             if (a.mask[i]) tilt_at(&s, i, (double)a.distance[i], (double)w[i], &expected);
             for (int j = 0; j < how.samples; j++) {
                 const float *sample = tape->sample + (i * how.samples + j) * 4;
-                float seed = j == 0 ? ws[i] : 0.0f;
+                float seed = j > 0 ? 0.0f : a.mask[i] || !(sample[0] < 0.0f) ? ws[i] : -ws[i]; /* of |f| */
                 if (a.mask[i] && fabsf(sample[0]) <= 0.1f) seed += alpha * (float)r.z * w[i];
                 if (fabsf(sample[0]) > 1e30f) continue; /* fewer than K samples */
                 memcpy(points + 3 * n, sample + 1, 3 * sizeof(float));
@@ -1977,6 +2015,7 @@ int main(int argc, char **argv)
     RUN(silhouette_backward_at_misses_is_the_derivative_at_the_sample);
     RUN(silhouette_backward_at_misses_is_near_the_derivative_of_the_least_value);
     RUN(silhouette_backward_off_the_sphere_moves_only_the_camera);
+    RUN(silhouette_backward_of_rays_that_start_inside_matches_differences);
     RUN(silhouette_backward_with_the_sphere_behind_the_camera_matches_differences);
     RUN(analytic_normal_backward_in_camera_space_matches_differences);
     RUN(analytic_normal_backward_in_world_space_matches_differences);

@@ -1411,6 +1411,7 @@ static void disti_job_task(void *arg, int index, int worker)
 static void disti_run(dist_context *ctx, int count, dist_task_fn fn, void *arg)
 {
     disti_job job = {fn, arg};
+    if (count <= 0) return;
     if (ctx->scheduler.run_fn) {
         ctx->scheduler.run_fn(ctx->scheduler.user, count, disti_job_task, &job);
         return;
@@ -8149,11 +8150,18 @@ static int disti_scan_number(const char **s, double *out)
     return disti_parse_double(s, *s + strlen(*s), out) && disti_finite_double(*out);
 }
 
+/* As floats: what a float of 1e-6 is written as, 9.99999997e-7, is no less than 1e-6. */
+static int disti_below(double value, double low)
+{
+    return value < low && (value < -3e38 || (float)value < (float)low);
+}
+
 /* A metadata number within [low, high]; absent: value. */
 static double disti_loader_number(disti_loader *loader, const char *key, double low, double high, double value)
 {
     const char *s = disti_archive_meta(&loader->archive, key);
-    if (s && (!disti_scan_number(&s, &value) || *s || value < low || value > high)) disti_loader_bad(loader, key);
+    if (s && (!disti_scan_number(&s, &value) || *s || disti_below(value, low) || value > high))
+        disti_loader_bad(loader, key);
     return loader->status == DIST_OK ? value : low;
 }
 
@@ -8194,7 +8202,7 @@ static dist_status disti_loader_activation(disti_loader *loader)
     int good = index < 6 && (!scaled || *s != ':' || (s++, disti_scan_number(&s, &first)));
     double other = first;
     good = good && (!sine || *s != ',' || (s++, disti_scan_number(&s, &other)));
-    if (!good || *s || !(first >= 1e-6 && first <= 1e6 && other >= 1e-6 && other <= 1e6))
+    if (!good || *s || disti_below(first, 1e-6) || first > 1e6 || disti_below(other, 1e-6) || other > 1e6)
         return disti_loader_bad(loader, "dist.activation");
     net->first_scale = (float)first;
     net->scale = (float)other;

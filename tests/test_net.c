@@ -932,6 +932,49 @@ TEST(the_file_that_the_wrong_ones_are_made_of_is_right)
 
 #define REFUSED(status, part, meta, tensors) refused(status, part, meta, tensors, "F32", -1, 0.0f, __FILE__, __LINE__)
 
+/* The last value of the file's table of contents, so that a byte beyond it is a byte beyond a block of memory. */
+TEST(channels_that_end_the_header_are_read_no_further)
+{
+    static const char *const channels[] = {"r", "sdf,r", "sdf,r,g", "r,g,b", "sdf,r,g,b", "rgb"};
+    for (size_t k = 0; k < sizeof channels / sizeof channels[0]; k++) {
+        char header[256];
+        dist_context *ctx = test_context();
+        size_t n = (size_t)snprintf(header, sizeof header,
+                                    "{\"a\":{\"dtype\":\"F32\",\"shape\":[0],\"data_offsets\":[0,0]},"
+                                    "\"__metadata__\":{\"dist.channels\":\"%s\"}}",
+                                    channels[k]);
+        unsigned char *bytes = (unsigned char *)calloc(1, 8 + n);
+        if (!bytes) exit(1);
+        bytes[0] = (unsigned char)n;
+        memcpy(bytes + 8, header, n);
+        CHECK(dist_net_load(ctx, bytes, 8 + n) == NULL);
+        CHECK_STATUS(DIST_BAD_FILE, dist_context_status(ctx), ctx);
+        free(bytes);
+        dist_context_destroy(ctx);
+    }
+}
+
+/* 1e-6, the least that a bound and a scale may be, is no float: it is written as a number somewhat below. */
+TEST(the_least_numbers_a_file_may_say_are_floats)
+{
+    static const char *const least[] = {
+        "\"dist.bound\":\"9.99999997e-7\"", "\"dist.activation\":\"sine:9.99999997e-7\"",
+        "\"dist.bound\":\"0.000001\"", "\"dist.activation\":\"softplus:1e-6\""};
+    for (size_t k = 0; k < sizeof least / sizeof least[0]; k++) {
+        dist_context *ctx = test_context();
+        size_t size;
+        unsigned char *bytes = file_of(least[k], good_tensors, "F32", -1, 0.0f, &size);
+        dist_net *net = dist_net_load(ctx, bytes, size);
+        CHECK_STATUS(DIST_OK, dist_context_status(ctx), ctx);
+        free(bytes);
+        dist_net_destroy(net);
+        dist_context_destroy(ctx);
+    }
+    REFUSED(DIST_BAD_FILE, "dist.bound", "\"dist.bound\":\"9.9999e-7\"", good_tensors);
+    REFUSED(DIST_BAD_FILE, "dist.bound", "\"dist.bound\":\"-1e300\"", good_tensors);
+    REFUSED(DIST_BAD_FILE, "dist.activation", "\"dist.activation\":\"sine:9.9999e-7\"", good_tensors);
+}
+
 TEST(tensors_that_do_not_fit_are_refused_with_a_sentence)
 {
     REFUSED(DIST_BAD_FILE, "bias", "", "lin0.weight 4 5;lin0.bias 4;lin1.weight 1 4;");
@@ -1381,6 +1424,8 @@ int main(int argc, char **argv)
     RUN(set_weights_makes_one_net_the_other);
     RUN(numbers_that_are_not_finite_are_refused_and_change_nothing);
     RUN(the_file_that_the_wrong_ones_are_made_of_is_right);
+    RUN(channels_that_end_the_header_are_read_no_further);
+    RUN(the_least_numbers_a_file_may_say_are_floats);
     RUN(tensors_that_do_not_fit_are_refused_with_a_sentence);
     RUN(a_layer_missing_in_the_middle_is_refused);
     RUN(metadata_that_means_nothing_is_refused_with_a_sentence);

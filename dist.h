@@ -678,7 +678,7 @@ DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *ta
 /* Each returns weight * loss and adds its gradient to the d_ array unless that is NULL. n: pixels. Means are over the
    pixels that count; none, or a plane that is NULL: 0 and no gradient. Sums are kept in double.
    A target counts where it is finite and 0 < target < 1e5; mask may be NULL: then every pixel is a hit. What is not
-   finite does not count: a loss does not tell that a code or a picture is spoiled. */
+   finite does not count: a loss does not tell that a code or a picture is spoiled. Nor does such a weight: 0. */
 
 /* mean |depth - target| over hit, observed pixels */
 DIST_API float dist_loss_depth(size_t n, const float *depth, const float *target, const unsigned char *mask,
@@ -14057,7 +14057,7 @@ static float disti_loss_absolute(size_t n, size_t channels, const float *x, cons
 {
     double sum = 0.0;
     size_t count = 0;
-    if (!x || !target) return 0.0f;
+    if (!x || !target || !disti_finite(weight)) return 0.0f;
     for (size_t i = 0; i < n; i++) {
         if (!disti_loss_counts(channels, x, target, mask, i)) continue;
         for (size_t k = channels * i; k < channels * (i + 1); k++) sum += fabs((double)x[k] - (double)target[k]);
@@ -14101,7 +14101,7 @@ DIST_API float dist_loss_normal(size_t n, const float *normal, const float *targ
 {
     double sum = 0.0;
     size_t count = 0;
-    if (!normal || !target) return 0.0f;
+    if (!normal || !target || !disti_finite(weight)) return 0.0f;
     for (size_t i = 0; i < n; i++) {
         double inverse = disti_loss_normal_scale(normal, target, mask, i);
         if (!(inverse > 0.0)) continue;
@@ -14127,7 +14127,7 @@ static float disti_loss_silhouette(size_t n, const float *silhouette, const unsi
     double sum[2] = {0.0, 0.0};
     double count[2] = {0.0, 0.0};
     double scale[2];
-    if (!silhouette || !target) return 0.0f;
+    if (!silhouette || !target || !disti_finite(weight)) return 0.0f;
     for (size_t i = 0; i < n; i++) {
         if (!disti_finite(silhouette[i])) continue;
         int in = target[i] != 0;
@@ -14162,7 +14162,7 @@ DIST_API float dist_loss_silhouette_wrong(size_t n, const float *silhouette, con
 DIST_API float dist_loss_code(size_t n, const float *code, float weight, float *d_code)
 {
     double sum = 0.0;
-    if (!code) return 0.0f;
+    if (!code || !disti_finite(weight)) return 0.0f;
     for (size_t j = 0; j < n; j++) {
         if (!disti_finite(code[j])) continue;
         sum += (double)code[j] * (double)code[j];
@@ -14382,6 +14382,7 @@ DIST_API float dist_loss_photometric(const dist_photo *to, const dist_photo *fro
     if (!to || !from || !to->color || !to->depth || !from->color || !(ssim >= 0.0f && ssim <= 1.0f)) return 0.0f;
     if (disti_camera_check(NULL, &to->camera, "") != DIST_OK || disti_camera_check(NULL, &from->camera, "") != DIST_OK)
         return 0.0f;
+    if (!disti_finite(weight)) weight = 0.0f; /* what is seen is told all the same */
     pair.to = to;
     pair.from = from;
     pair.ssim = (double)ssim;

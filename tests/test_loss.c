@@ -166,6 +166,19 @@ TEST(losses_over_nothing_are_zero_without_gradient)
     CHECK_NEAR(0, dist_loss_code(5, NULL, 1.0f, NULL), 0);
 }
 
+TEST(a_weight_that_is_not_finite_is_a_weight_of_zero)
+{
+    const float weights[] = {loss_bits(0x7fc00000u), loss_bits(0x7f800000u), loss_bits(0xff800000u)};
+    for (int kind = 0; kind < KINDS; kind++) {
+        for (int k = 0; k < 3; k++) {
+            loss_case c;
+            loss_fill(&c, kind, 32);
+            CHECK_NEAR(0, loss_call(kind, &c, weights[k], c.d_x), 0);
+            for (size_t i = 0; i < 3 * N; i++) CHECK_NEAR(0, c.d_x[i], 0);
+        }
+    }
+}
+
 /* However few pixels are wrong, they weigh the same; a set without any adds nothing. */
 TEST(the_silhouette_of_wrong_pixels_does_not_fade)
 {
@@ -324,6 +337,7 @@ int main(int argc, char **argv)
     RUN(loss_gradients_are_added);
     RUN(depth_targets_that_are_not_seen_do_not_count);
     RUN(losses_over_nothing_are_zero_without_gradient);
+    RUN(a_weight_that_is_not_finite_is_a_weight_of_zero);
     RUN(the_silhouette_of_wrong_pixels_does_not_fade);
     RUN(target_normals_are_normalized_and_zero_ones_left_out);
     RUN(a_million_small_terms_are_summed_without_loss);

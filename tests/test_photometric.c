@@ -496,6 +496,7 @@ TEST(photometric_loss_of_bad_arguments_is_zero)
     memset(&desc, 0, sizeof desc);
     photo_fill(&c, 60);
     CHECK(dist_loss_photometric(&c.to, &c.from, &desc, 1.0f, NULL, NULL) > 0);
+    CHECK_NEAR(0, dist_loss_photometric(&c.to, &c.from, &desc, (float)NAN, d_depth, NULL), 0);
     CHECK_NEAR(0, dist_loss_photometric(NULL, &c.from, NULL, 1.0f, d_depth, NULL), 0);
     CHECK_NEAR(0, dist_loss_photometric(&c.to, NULL, NULL, 1.0f, d_depth, NULL), 0);
     desc.ssim = 1.5f;

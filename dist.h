@@ -8900,7 +8900,7 @@ DIST_API dist_status dist_camera_set_colmap(dist_camera *camera, const float qua
     if (!disti_finite_all(4, quaternion) || !disti_finite_all(3, translation)) return DIST_NOT_FINITE;
     double q[4], length = 0.0;
     for (int i = 0; i < 4; i++) length += (double)quaternion[i] * (double)quaternion[i];
-    if (!(length > 1e-30)) return DIST_BAD_ARGUMENT;
+    if (!(length > 0.0)) return DIST_BAD_ARGUMENT;
     for (int i = 0; i < 4; i++) q[i] = (double)quaternion[i] / sqrt(length);
     double w = q[0], x = q[1], y = q[2], z = q[3];
     double m[9] = {1 - 2 * (y * y + z * z), 2 * (x * y - w * z),     2 * (x * z + w * y),

@@ -240,7 +240,7 @@ TEST(colmap_goes_there_and_back_in_every_branch)
         if (k < 4) q[0] = k == 0, q[1] = k == 1, q[2] = k == 2, q[3] = k == 3; /* half turns about the axes */
         double length = sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]);
         for (int i = 0; i < 4; i++) q[i] /= length;
-        float scale = k % 3 == 0 ? 1.0f : k % 3 == 1 ? -1.0f : 7.5f; /* -q is the same; row 30: any length */
+        float scale = k % 3 == 0 ? 1.0f : k % 3 == 1 ? -1.0f : k % 2 ? 7.5f : 1e-30f; /* -q is the same; any length */
         float quaternion[4], back[4], t[3] = {1, -2, 3}, t_back[3];
         for (int i = 0; i < 4; i++) quaternion[i] = (float)q[i] * scale;
         dist_camera c = plain_camera();

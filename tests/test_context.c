@@ -318,6 +318,24 @@ TEST(garbage_descs_come_back_as_a_context_that_says_so)
     CHECK_EQUAL(0, allocator.errors);
 }
 
+TEST(a_scheduler_is_not_asked_for_no_tasks)
+{
+    dist_context_desc desc = test_context_desc();
+    test_scheduler scheduler;
+    float ball[4] = {0, 0, 0, 0.5f};
+    dist_field field = dist_field_sphere(ball);
+    scheduler.workers = desc.workers = 2;
+    desc.scheduler = test_scheduler_hook(&scheduler);
+    dist_context *ctx = dist_context_create(&desc);
+    scheduler.calls = 0;
+    CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &field, 0, NULL, NULL, NULL), ctx);
+    CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, 0, NULL, NULL, NULL, NULL, NULL), ctx);
+    CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &field, 0, NULL, NULL, NULL, NULL), ctx);
+    CHECK_STATUS(DIST_OK, dist_field_collide(ctx, &field, 0, NULL, NULL), ctx);
+    CHECK_EQUAL(0, scheduler.calls);
+    dist_context_destroy(ctx);
+}
+
 /* 0: none is run; 1: every other; 2: each twice; 3: worker -1; 4: workers from 1 on; 5: indices from 1 on. */
 static void wrong_schedule(void *user, int count, dist_task_fn task_fn, void *arg)
 {
@@ -646,6 +664,7 @@ int main(int argc, char **argv)
     RUN(half_an_allocator_makes_no_context);
     RUN(a_scheduler_of_any_order_gives_the_same_pictures_and_gradients);
     RUN(garbage_descs_come_back_as_a_context_that_says_so);
+    RUN(a_scheduler_is_not_asked_for_no_tasks);
     RUN(a_scheduler_that_does_not_do_what_it_should_is_refused);
     RUN(an_allocator_that_ignores_the_alignment_is_refused);
     RUN(every_isa_is_in_force_or_refused_by_name);

@@ -949,18 +949,26 @@ TEST(moving_a_placement_keeps_it_a_similarity)
     CHECK_NEAR(0, disti_rotation_off(m, &determinant), 1e-6);
     CHECK_NEAR(1, determinant, 1e-6);
     CHECK_NEAR(1, (double)s.scale / exp(logarithm), 1e-4);
-    float zero[7] = {0};
+    float step[7] = {0};
     memset(&s, 0, sizeof s);
-    dist_similarity_move(&s, zero);
+    dist_similarity_move(&s, step);
     CHECK_NEAR(1, s.scale, 0);
     CHECK_NEAR(1, s.rotation[4], 0);
-    dist_similarity_move(NULL, zero);
+    dist_similarity_move(NULL, step);
     dist_similarity_move(&s, NULL);
     for (int k = 0; k < 3; k++) { /* never 0, which would mean 1 */
         float far[7] = {k == 1 ? 1000.0f : -1000.0f, 0, 0, 0, 0, 0, 0};
         dist_similarity_move(&s, far);
         CHECK(s.scale > 0 && test_finite((double)s.scale));
     }
+    s.scale = 1e-30f; /* e^100 alone is more than a float holds */
+    step[0] = 100.0f;
+    dist_similarity_move(&s, step);
+    CHECK_NEAR(1, (double)s.scale / (1e-30 * exp(100.0)), 1e-6);
+    s.scale = 1e30f;
+    step[0] = -110.0f;
+    dist_similarity_move(&s, step);
+    CHECK_NEAR(1, (double)s.scale / (1e30 * exp(-110.0)), 1e-6);
 }
 
 static int refused(dist_context *ctx, const dist_instance *instance, const char *sentence)

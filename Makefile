@@ -1,6 +1,6 @@
 # dist.h needs no build. This makes the examples, the benchmarks and the tests; a C compiler and make are enough.
 #
-#   make                every examples/*.c, tools/*.c and bench/*.c as build/NAME
+#   make                every examples/*.c and bench/*.c as build/NAME
 #   make demo           the demonstration: fits a shape to one depth picture, results in out/
 #   make test           all tests, in a few minutes; the last line is the sum
 #   make torture        the table of hard cases in every instruction set, and 20,000 random scenes: about five minutes
@@ -26,7 +26,7 @@ STRICT = -std=c99 -Wall -Wextra -Wpedantic -Wconversion -Wsign-conversion -Wshad
 TEST_DIR = build
 TEST_FLAGS = $(STRICT)
 
-PROGRAMS = $(patsubst examples/%.c,build/%,$(wildcard examples/*.c)) $(patsubst tools/%.c,build/%,$(wildcard tools/*.c))
+PROGRAMS = $(patsubst examples/%.c,build/%,$(wildcard examples/*.c))
 BENCHES = $(patsubst bench/%.c,build/%,$(wildcard bench/*.c))
 RESULTS = $(filter build/results_%,$(BENCHES))
 TESTS = $(patsubst tests/%.c,$(TEST_DIR)/%,$(wildcard tests/test_*.c))
@@ -56,9 +56,6 @@ build/scheduler: examples/scheduler.c dist.h $(wildcard examples/*.h)
 	$(CC) $(CFLAGS) $(STRICT) $(OPENMP) -pthread $< -o $@ -lm
 
 build/%: examples/%.c dist.h $(wildcard examples/*.h) | build/stb/done
-	$(CC) $(CFLAGS) $(STRICT) $(OPENMP) $(STB) $< -o $@ -lm
-
-build/%: tools/%.c dist.h $(wildcard examples/*.h tools/*.h) | build/stb/done
 	$(CC) $(CFLAGS) $(STRICT) $(OPENMP) $(STB) $< -o $@ -lm
 
 build/%: bench/%.c dist.h $(wildcard examples/*.h bench/*.h) | build/stb/done

@@ -565,10 +565,10 @@ typedef struct dist_hit {
     int status;     /* DIST_RAY_* */
 } dist_hit;
 
-/* Traces n rays (origins (n, 3), directions (n, 3) of any nonzero length) with the guarded tracer: picking, shadows,
-   visibility. The first surface in front of each origin; with how.any_hit any of them. A ray that is 0 or not finite
-   is DIST_RAY_NOT_FINITE. No cone and no neighbor helps a free ray to see what is thin: with how.certified it asks
-   more, and steps over nothing as far as the Lipschitz figures are bounds. */
+/* Traces n rays (origins (n, 3), directions (n, 3) of any length from 1.2e-38 on) with the guarded tracer: picking,
+   shadows, visibility. The first surface in front of each origin; with how.any_hit any of them. A ray that is 0 or not
+   finite is DIST_RAY_NOT_FINITE. No cone and no neighbor helps a free ray to see what is thin: with how.certified it
+   asks more, and steps over nothing as far as the Lipschitz figures are bounds. */
 DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size_t n, const float *origins,
                                 const float *directions, const dist_render_desc *how, dist_hit *hits,
                                 dist_stats *stats);
@@ -641,7 +641,7 @@ typedef struct dist_images {
 
 /* Keeps what the gradient needs: one distance and one status a pixel, and the paper's K samples where asked for. */
 typedef struct dist_tape dist_tape;
-/* For pictures of exactly this camera's size and of this desc's trace, paper_row and samples.
+/* For pictures of exactly this camera's size and of this desc's trace and samples.
    With desc->warm_start the tape also keeps what the next picture can start from (18 bytes a pixel more). A dist_render
    with warm_start then verifies the last picture's hits and near misses, one query each or none, instead of marching.
    It is meant for an optimization that moves the surface by less than about a pixel a step. Whatever does not
@@ -1202,9 +1202,14 @@ typedef struct disti_limit {
 } disti_limit;
 
 /* More points or rays than any memory holds: a -1 turned size_t, most likely. */
+static int disti_count_fits(size_t n)
+{
+    return n >> 20 >> 19 == 0 && n <= (size_t)-1 / (3 * sizeof(float)); /* 32 bits have no >> 39 */
+}
+
 static dist_status disti_count_check(dist_context *ctx, size_t n, const char *function)
 {
-    if (n >> 20 >> 19 == 0 && n <= (size_t)-1 / (3 * sizeof(float))) return DIST_OK; /* 32 bits have no >> 39 */
+    if (disti_count_fits(n)) return DIST_OK;
     return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: n is %d, more than memory can hold", function, (double)n, 0);
 }
 
@@ -4934,7 +4939,7 @@ DIST_API dist_field dist_scene_field(dist_scene *scene)
         field.lipschitz_far = DISTI_MAX(field.lipschitz_far, disti_steepest(f));
         if (clamp > 0.0f && !(field.clamp > 0.0f && field.clamp < clamp)) field.clamp = clamp;
         known = known && f->cost > 0.0f;
-        field.cost = known ? field.cost + f->cost : 0.0f;
+        field.cost = known ? DISTI_MIN(field.cost + f->cost, 2e38f) : 0.0f;
         if (!f->color_fn) field.color_fn = NULL;
         if (!f->color_adjoint_fn) field.color_adjoint_fn = NULL;
     }
@@ -15219,8 +15224,9 @@ static dist_status disti_chamfer_one_way(dist_context *ctx, const disti_tree *fr
 static dist_status disti_chamfer_check(dist_context *ctx, size_t n, const float *points, const char *what)
 {
     if (n == 0) return disti_refuse(ctx, "dist_chamfer: %s has no points", what);
-    dist_status status = disti_count_check(ctx, n, "dist_chamfer");
-    if (status != DIST_OK) return status;
+    if (!disti_count_fits(n))
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_chamfer: %s has %d points, more than memory can hold", what,
+                          (double)n, 0);
     if (!points) return disti_refuse(ctx, "dist_chamfer: %s is NULL", what);
     for (size_t i = 0; i < n; i++)
         if (!disti_finite_all(3, points + 3 * i))
@@ -15548,11 +15554,15 @@ static int disti_mesh_read_corner(disti_mesh_text *r, size_t k, double index)
     return 1;
 }
 
+/* Without vertices: what disti_write_obj makes of an empty mesh, a comment and nothing else. */
 static int disti_read_obj(disti_mesh_text *r)
 {
     disti_text *t = &r->text;
+    int comment = 0, other = 0;
     for (; t->at < t->end; disti_skip_line(t)) {
         disti_skip_blank(t);
+        if (t->at < t->end && *t->at == '#') comment = 1;
+        else if (t->at < t->end && !disti_is_space(*t->at)) other = 1;
         if (t->end - t->at < 2 || !disti_is_blank(t->at[1]) || (t->at[0] != 'v' && t->at[0] != 'f')) continue;
         int face = *t->at++ == 'f';
         double v[3];
@@ -15572,7 +15582,7 @@ static int disti_read_obj(disti_mesh_text *r)
             if (!disti_mesh_read_corner(r, k, (double)(i > 0 ? i - 1 : i + (int64_t)r->mesh->vertex_count))) return 0;
         }
     }
-    if (r->mesh->vertex_count) return 1;
+    if (r->mesh->vertex_count || (comment && !other)) return 1;
     return disti_mesh_fail(r, DIST_BAD_FILE, "neither PLY nor OFF nor an OBJ with vertices", 0);
 }
 
@@ -15865,6 +15875,7 @@ static void disti_write_obj_vectors(disti_writer *sink, const char *letter, size
 
 static void disti_write_obj(disti_writer *sink, const dist_mesh *mesh)
 {
+    if (!mesh->vertex_count) disti_put_text(sink, "# no surface\n");
     disti_write_obj_vectors(sink, "v", mesh->vertex_count, mesh->vertices);
     if (mesh->normals) disti_write_obj_vectors(sink, "vn", mesh->vertex_count, mesh->normals);
     for (size_t i = 0; i < mesh->triangle_count; i++) {

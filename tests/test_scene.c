@@ -728,6 +728,23 @@ TEST(twenty_instances_cost_a_query_no_more_than_one_and_a_fifth)
     dist_context_destroy(ctx);
 }
 
+TEST(a_scene_of_the_dearest_fields_is_not_refused)
+{
+    dist_context *ctx = test_context();
+    float sphere[4] = {0, 0, 0, 1}, point[3] = {0, 0, 0.5f}, sdf = 0;
+    dist_field dear = dist_field_sphere(sphere);
+    dist_instance instances[2];
+    memset(instances, 0, sizeof instances);
+    dear.cost = 2e38f;
+    instances[0].field = instances[1].field = &dear;
+    dist_scene *scene = dist_scene_create(ctx, 2, instances);
+    dist_field field = dist_scene_field(scene);
+    CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &field, 1, point, &sdf, NULL), ctx);
+    CHECK_NEAR(-0.5, sdf, 1e-5);
+    dist_scene_destroy(scene);
+    dist_context_destroy(ctx);
+}
+
 TEST(a_scene_has_the_same_bits_for_any_number_of_threads)
 {
     enum { N = 2500 };
@@ -1254,6 +1271,7 @@ int main(int argc, char **argv)
     RUN(a_small_instance_is_as_sharp_as_alone);
     RUN(a_scene_of_scenes_is_the_flat_scene);
     RUN(twenty_instances_cost_a_query_no_more_than_one_and_a_fifth);
+    RUN(a_scene_of_the_dearest_fields_is_not_refused);
     RUN(a_scene_has_the_same_bits_for_any_number_of_threads);
     RUN(a_placement_is_found_from_a_picture_alone_and_with_the_code);
     RUN(a_pixel_pulls_on_the_instance_that_it_shows_alone);

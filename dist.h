@@ -3017,7 +3017,7 @@ static void disti_few_avx512(const disti_few *g)
     else if (g->points <= 10) disti_few_ten_avx512(g);
     else disti_few_twelve_avx512(g);
 }
-static const disti_part disti_parts_avx512[] = {{13, 24, 12}, {33, 44, 32}, {0, 0, 0}};
+static const disti_part disti_parts_avx512[] = {{13, 24, 12}, {33, 48, 32}, {0, 0, 0}};
 #undef DISTI_ABS
 #undef DISTI_GREATER
 #undef DISTI_TWO

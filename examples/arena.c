@@ -40,8 +40,12 @@ static void say(void *user, dist_status status, const char *message)
     fprintf(stderr, "arena: %s (%d)\n", message, status);
 }
 
-int main(void)
+int main(int argc, char **argv)
 {
+    if (argc > 1) {
+        fprintf(stderr, "arena: takes no arguments, got %s\n", argv[1]);
+        return 2;
+    }
     arena a = {memory + (64 - (size_t)memory % 64) % 64, ARENA, 0};
     dist_context_desc settings = {.workers = 1, .allocator = {&a, arena_alloc, arena_free}, .logger = {NULL, say}};
     const float eye[3] = {1.4f, 1.0f, 2.0f}, at[3] = {0, 0, 0}, up[3] = {0, 1, 0};

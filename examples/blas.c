@@ -41,8 +41,9 @@ static double speed(const dist_context_desc *desc, float *sdf)
 }
 #endif
 
-int main(void)
+int main(int argc, char **argv)
 {
+    if (argc > 1) { fail("blas takes no arguments, got %s", argv[1]); }
 #ifdef WITH_CBLAS
     rng r = rng_begin(1);
     for (int i = 0; i < 3 * POINTS; i++) {

@@ -207,6 +207,12 @@ static inline const char *option_text(options *o)
     return value;
 }
 
+/* Says that an option that was given has no effect without, or beside, something else: `text`. */
+static inline void option_belongs(int given, const char *name, const char *text)
+{
+    if (given) { fail("%s %s", name, text); }
+}
+
 static inline double option_number(options *o, double smallest, double largest)
 {
     const char *text = option_text(o);
@@ -422,17 +428,35 @@ static inline void close_file(FILE *file, const char *path)
     if (fclose(file) != 0 || bad) { fail("%s cannot be written in full", path); }
 }
 
-/* Makes the folders of STEM and tries whether it can be written there: better known before the work than after. */
+#ifndef S_ISDIR
+#define S_ISDIR(mode) (((mode) & S_IFMT) == S_IFDIR)
+#endif
+
+static inline int is_folder(const char *path)
+{
+    struct stat about;
+    return stat(path, &about) == 0 && S_ISDIR(about.st_mode);
+}
+
+/* Tries whether a file can be written, and makes its folders: better known before the work than after. */
+static inline void check_path(const char *path)
+{
+    struct stat about;
+    make_folders(path);
+    int there = stat(path, &about) == 0;
+    fclose(open_file(path, "ab"));
+    if (!there) { remove(path); }
+}
+
+/* As above for the files STEM.json and so on. */
 static inline void check_stem(const char *stem)
 {
     char path[PATH_SIZE];
     size_t length = strlen(stem);
-    if (length == 0 || stem[length - 1] == '/') { fail("--out \"%s\" is a folder: name the files, too", stem); }
-    make_folders(stem);
-    FILE *file = open_file(path_of(path, stem, ".json"), "ab");
-    int empty = fseek(file, 0, SEEK_END) == 0 && ftell(file) == 0;
-    fclose(file);
-    if (empty) { remove(path); }
+    if (length == 0 || stem[length - 1] == '/' || is_folder(stem)) {
+        fail("--out \"%s\" is a folder: name the files, too", stem);
+    }
+    check_path(path_of(path, stem, ".json"));
 }
 
 /* All bytes of a file with a zero behind them; give them back with free. */
@@ -754,6 +778,7 @@ static inline float *choose_code(const dist_net *net, const char *text)
         return code;
     }
     if (!text[strspn(text, "0123456789")]) {
+        if (count == 0) { fail("code %s asked for, but the model stores none; a FILE can hold one", text); }
         long index = strtol(text, NULL, 10);
         if (index >= count) { fail("code %s asked for; the model stores %d, counted from 0", text, count); }
         memcpy(code, dist_net_code(net, (int)index), (size_t)n * sizeof *code);
@@ -763,6 +788,9 @@ static inline float *choose_code(const dist_net *net, const char *text)
         if (count == 0) { fail("\"%s\" is no file, and the model stores no codes", text); }
         fail("\"%s\" is neither one of the model's codes, 0 to %d, nor a file", text, count - 1);
     }
+    FILE *file = fopen(text, "rb");
+    if (!file) { fail("\"%s\" is no INDEX, not \"zero\", \"mean\" or \"random:SEED\", and no file to be read", text); }
+    fclose(file);
     read_code(text, (size_t)n, code);
     return code;
 }

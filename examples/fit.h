@@ -104,6 +104,9 @@ static inline void check_fit_options(const fit_options *f)
 {
     if (f->depth_path && f->target) { fail("--depth and --target are two observations; give one"); }
     if (f->mask_path && !f->depth_path) { fail("--mask belongs to --depth FILE.pfm"); }
+    if (f->no_mask && !(f->weights[0] > 0.0f)) {
+        fail("--no-mask and a weight of 0 for the depth leave nothing to fit");
+    }
     if (f->mask_path && f->no_mask) { fail("--mask and --no-mask contradict each other"); }
     if (f->points && f->keep < 100.0) { fail("--keep and --points are two ways to choose the pixels; give one"); }
     for (int i = 0; i < 3; i++) {

@@ -385,6 +385,8 @@ static request read_options(int argc, char **argv)
         fail("what is seen? give --target, --depth or --demo; --help tells more");
     }
     check_fit_options(o);
+    option_belongs(r.warm && (o->how.trace == DIST_TRACE_PAPER || o->no_mask || !(o->weights[1] > 0.0f)), "--warm",
+                   "starts the guarded tracer's pictures, those with a silhouette");
     if (!o->out && !r.demo) { fail("--out STEM is needed: where the results go"); }
     if (r.demo && o->keep >= 100.0 && !o->points) { o->keep = 5.0; }
     if (!o->out) { o->out = "out/demo"; }

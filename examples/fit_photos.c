@@ -667,7 +667,6 @@ static request read_options(int argc, char **argv)
     static const char *const backgrounds[] = {"sky", "plain", NULL};
     request r;
     memset(&r, 0, sizeof r);
-    r.width = r.height = 112;
     r.views = 24;
     r.batch = 8;
     r.iterations = 64;
@@ -676,10 +675,9 @@ static request read_options(int argc, char **argv)
     r.weights[1] = 1.0f;
     r.blur = 4.0f;
     r.fov = 45.0f;
-    r.cells = 48;
-    r.off[0] = r.off[1] = 10.0f;
-    r.off[2] = 0.1f;
+    r.off[0] = 100.0f; /* not given */
     r.place[0] = 1.0f;
+    int taken = 0;
     options walk = options_begin(argc, argv, usage);
     while (option_next(&walk)) {
         if (option_is_word(&walk) && !r.model) {
@@ -698,16 +696,20 @@ static request read_options(int argc, char **argv)
             r.similarity = option_flag(&walk);
         } else if (option_is(&walk, "--off")) {
             option_floats(&walk, 3, r.off);
+            if (!(r.off[0] > -99.0f && r.off[0] < 99.0f)) { fail("--off must stay below 99 percent"); }
         } else if (option_is(&walk, "--place")) {
             option_floats(&walk, 4, r.place);
         } else if (option_is(&walk, "--views")) {
             r.views = option_int(&walk, 2, 1000);
+            taken = 1;
         } else if (option_is(&walk, "--size")) {
             option_size(&walk, &r.width, &r.height);
         } else if (option_is(&walk, "--fov")) {
             r.fov = (float)option_number(&walk, 0.1, 175.0);
+            taken = 1;
         } else if (option_is(&walk, "--background")) {
             r.plain = option_choice(&walk, backgrounds);
+            taken = 1;
         } else if (option_is(&walk, "--batch")) {
             r.batch = option_int(&walk, 2, 1000);
         } else if (option_is(&walk, "--start")) {
@@ -743,7 +745,13 @@ static request read_options(int argc, char **argv)
     if (r.trials && r.start) { fail("--trials begins from random:1, random:2 ...; leave out --start"); }
     if (r.trials && r.photos) { fail("--trials needs a known shape; leave out --photos"); }
     if (r.weights[0] < 0 || r.weights[1] < 0) { fail("--weights must not be negative"); }
-    if (!(r.off[0] > -99.0f && r.off[0] < 99.0f)) { fail("--off must stay below 99 percent"); }
+    option_belongs(r.photos && (taken || r.width), "--views, --size, --fov and --background",
+                   "are of photos that are taken, not of --photos");
+    option_belongs(r.off[0] < 100.0f && !r.similarity, "--off", "is where --similarity starts, which is not given");
+    option_belongs(r.cells && r.gradient != GRADIENT_MESH, "--mesh-cells", "belongs to --gradient mesh");
+    if (r.off[0] >= 100.0f) { r.off[0] = r.off[1] = 10.0f, r.off[2] = 0.1f; }
+    if (!r.cells) { r.cells = 48; }
+    if (!r.width) { r.width = r.height = 112; }
     int placed = r.place[0] != 1.0f || r.place[1] != 0.0f || r.place[2] != 0.0f || r.place[3] != 0.0f;
     if (placed && !(r.photos && r.similarity)) { fail("--place belongs to --photos with --similarity"); }
     if (!(r.place[0] > 0)) { fail("--place needs a scale above 0"); }

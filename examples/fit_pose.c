@@ -412,6 +412,10 @@ static void run_trials(dist_context *ctx, const dist_net *net, const request *as
     rng random = rng_begin((unsigned)o->seed);
     int counts[3] = {0, 0, 0}; /* good, ambiguous, lost */
     static const char *const verdicts[3] = {"", "same picture", "lost"};
+    size_t codes = (size_t)dist_net_code_count(net);
+    if (!o->target && codes == 0 && dist_net_code_size(net) > 0) {
+        fail("--trials chooses among the model's codes, and it stores none; give --target FILE");
+    }
     double *degrees = (double *)take((size_t)asked->trials, sizeof *degrees);
     double *distance = (double *)take((size_t)asked->trials, sizeof *distance);
     record *records = take_records(asked);
@@ -420,7 +424,7 @@ static void run_trials(dist_context *ctx, const dist_net *net, const request *as
     double start = seconds_now();
     printf("trial  shape  degrees off          distance off           mask IoU  depth error\n");
     for (int i = 0; i < asked->trials; i++) {
-        int index = (int)rng_index(&random, (size_t)dist_net_code_count(net));
+        int index = codes ? (int)rng_index(&random, codes) : -1;
         float *code = o->target ? choose_code(net, o->target) : NULL;
         dist_camera camera = view_camera(&o->view, 0.0f);
         dist_shape *truth = dist_shape_create(ctx, net, code ? code : dist_net_code(net, index));
@@ -570,7 +574,7 @@ static void write_report(const fit *f, const record *start, const record *end, c
     char path[PATH_SIZE];
     json j = json_open(path_of(path, o->out, ".json"));
     json_text(&j, "model", o->model);
-    json_text(&j, "target", o->target);
+    json_text(&j, "target", o->target ? o->target : "0");
     for (int i = 0; i < 2; i++) {
         json_score(&j, "loss", when[i], (i ? end : start)->loss);
         json_score(&j, "depth_error", when[i], scores[i].depth_error);
@@ -722,7 +726,6 @@ static request read_options(int argc, char **argv)
     if (!o->out && !r.trials) { fail("--out STEM is needed: where the results go"); }
     if (!o->model) { o->model = "embedded"; }
     if (!o->view.width && !o->depth_path) { o->view.width = o->view.height = 64; }
-    if (!o->target && !r.trials) { o->target = "0"; }
     if (o->out) { check_stem(o->out); }
     return r;
 }

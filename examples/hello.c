@@ -8,8 +8,9 @@ enum { W = 512, H = 512 };
 static float depth[W * H], normal[3 * W * H];
 static unsigned char mask[W * H];
 
-int main(void)
+int main(int argc, char **argv)
 {
+    if (argc > 1) { fail("hello takes no arguments, got %s", argv[1]); }
     dist_context *ctx = dist_context_create(NULL);
     dist_net *net = load_embedded(ctx); /* or dist_net_load_file(ctx, "model.safetensors") */
     dist_shape *shape = dist_shape_create(ctx, net, dist_net_code(net, 0));

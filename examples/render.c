@@ -54,7 +54,7 @@ static int option_planes(options *o)
     static const char *const names[] = {"depth", "normal", "silhouette", "mask", "color"};
     const char *text = option_text(o);
     int planes = 0;
-    for (const char *at = text; *at; at += *at == ',') {
+    for (const char *at = text; at; at = *at ? at + 1 : NULL) {
         size_t length = strcspn(at, ",");
         int found = 0;
         for (int i = 0; i < 5; i++) {
@@ -133,7 +133,7 @@ static job read_options(int argc, char **argv)
         } else if (option_is(&o, "--alpha")) {
             j.how.step_scale = (float)option_number(&o, 0.01, 10.0);
         } else if (option_is(&o, "--steps")) {
-            j.how.max_steps = option_int(&o, 1, 100000);
+            j.how.max_steps = option_int(&o, 1, 60000);
         } else if (option_is(&o, "--normal-delta")) {
             j.how.normal_mode = DIST_NORMAL_DIFFERENCE;
             j.how.normal_delta = (float)option_number(&o, 1e-6, 1.0);
@@ -151,7 +151,12 @@ static job read_options(int argc, char **argv)
     }
     if (j.lit && j.lighting.count == 0) { j.lighting.count = 2; }
     if (j.color_code && !j.texture) { fail("--color-code is of a texture: --texture names it"); }
+    option_belongs(j.frames && (j.zoom || j.planes), "--zoom and --planes", "are of one picture, not of --turntable");
     if (j.zoom_at_given && !j.zoom) { fail("--zoom-at is of --zoom, which is not given"); }
+    if (j.zoom_at_given && !(j.zoom_at[0] >= 0.0f && j.zoom_at[0] <= (float)j.view.width && j.zoom_at[1] >= 0.0f &&
+                             j.zoom_at[1] <= (float)j.view.height)) {
+        fail("--zoom-at %g,%g lies outside the picture", (double)j.zoom_at[0], (double)j.zoom_at[1]);
+    }
     if (j.relit && j.frames) { fail("--relight is of one picture, and --turntable asks for %d", j.frames); }
     if (j.report && j.frames) { fail("--report is of one picture, and --turntable asks for %d", j.frames); }
     if (j.zoom > j.view.width || j.zoom > j.view.height) { fail("--zoom %d leaves no pixel of the picture", j.zoom); }

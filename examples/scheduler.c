@@ -141,8 +141,12 @@ static void job_end(job *j)
 
 int main(int argc, char **argv)
 {
-    int workers = argc > 1 ? atoi(argv[1]) : 2;
-    if (workers < 1 || workers > WORKERS_MAX) { fail("the number of workers must be 1 to %.0f", (double)WORKERS_MAX); }
+    char *end = NULL;
+    long workers_asked = argc > 1 ? strtol(argv[1], &end, 10) : 2;
+    if (argc > 2 || (end && (end == argv[1] || *end)) || workers_asked < 1 || workers_asked > WORKERS_MAX) {
+        fail("scheduler [N]: the number of workers, 1 to %d (default 2)", (int)WORKERS_MAX);
+    }
+    int workers = (int)workers_asked;
     pool threads;
     pool_start(&threads, workers);
     dist_context_desc with_pool = {.workers = workers, .scheduler = {&threads, pool_run}};

@@ -706,7 +706,7 @@ static void parse_families(options *o, settings *how)
 {
     const char *text = option_text(o);
     how->family_count = 0;
-    while (*text) {
+    for (; text; text = *text ? text + 1 : NULL) {
         size_t length = strcspn(text, ",");
         int family = 0;
         while (family < SHAPE_FAMILIES &&
@@ -715,8 +715,10 @@ static void parse_families(options *o, settings *how)
         if (family == SHAPE_FAMILIES || how->family_count == SHAPE_FAMILIES) {
             fail("%s needs a list of sofas, planes, tables, cars, got \"%s\"", o->name, text);
         }
+        for (int i = 0; i < how->family_count; i++)
+            if (how->families[i] == family) fail("%s names %s twice", o->name, shape_family_name(family));
         how->families[how->family_count++] = family;
-        text += length + (text[length] == ',');
+        text += length;
     }
 }
 
@@ -748,7 +750,6 @@ static settings parse(int argc, char **argv)
     memset(&how, 0, sizeof how);
     for (int i = 0; i < SHAPE_FAMILIES; i++) how.families[how.family_count++] = i;
     how.shapes = 64;
-    how.steps = 20000;
     how.batch = 256;
     how.rate = 3e-3f;
     how.code_rate = 1.5e-2f;
@@ -775,6 +776,14 @@ static settings parse(int argc, char **argv)
         else if (option_is(&o, "--iterations")) how.iterations = option_int(&o, 1, 1000000);
         else option_unknown(&o);
     }
+    int trained = how.layers || how.width || how.code;
+    int lengths = (how.steps > 0) + (how.epochs > 0) + (how.minutes > 0);
+    option_belongs(how.resume && trained, "--layers, --width and --code", "are what the model of --resume has");
+    option_belongs(lengths > 1, "--steps, --epochs and --minutes", "are three ways to say how long; give one");
+    option_belongs(how.evaluate && (trained || lengths || how.resume || how.header || how.color),
+                   "--layers, --width, --code, --steps, --epochs, --minutes, --resume, --header and --color",
+                   "are for training, not for --evaluate");
+    if (!how.steps) how.steps = 20000;
     if (!how.layers) how.layers = how.color ? 3 : 5;
     if (!how.width) how.width = how.color ? 64 : 128;
     if (!how.code) how.code = how.color ? 8 : 32;
@@ -782,6 +791,8 @@ static settings parse(int argc, char **argv)
     if (!how.pool) how.pool = how.color ? 2000 : 24000;
     if (!how.evaluate && !how.out) fail("--out FILE.safetensors is missing; --help lists the options");
     if (how.evaluate && how.out) fail("--evaluate measures a model, --out trains one: choose one of them");
+    if (how.out) check_path(how.out);
+    if (how.header) check_path(how.header);
     return how;
 }
 

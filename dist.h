@@ -158,6 +158,7 @@ typedef struct dist_context_desc {
    refused hook) comes back as a context whose status says so and with which every further call fails with that
    status. */
 DIST_API dist_context *dist_context_create(const dist_context_desc *desc);
+/* NULL is allowed, here as in every dist_..._destroy. Goes last: everything else that was made with it goes before. */
 DIST_API void dist_context_destroy(dist_context *ctx);
 
 /* First failure since the context was made or cleared. A NULL context: DIST_BAD_ARGUMENT. */
@@ -554,14 +555,15 @@ typedef struct dist_stats {
     float lipschitz;                    /* in force */
     float steepest; /* the figure that samples following one another along a ray called for, where that is above the
                        one in force, else 0: then how.certified proves nothing, render again with more than this */
-    float error;                        /* largest error over the hits; see dist_images.error */
+    float error; /* largest over the hits of what dist_images.error has: at a grazing ray on an outline that bound is
+                    much larger than the error, so this tells of the worst pixel, not of the picture */
 } dist_stats;
 
 /* One free ray's result. Distances are along the unit direction, how.max_distance is in lengths of the one given. */
 typedef struct dist_hit {
     float distance; /* of the hit, or of the sample of smallest |f|; a ray without one: nearest to the center */
     float error;    /* bound on the distance's error, as good as f's slopes are sampled; no neighbors are asked */
-    float sdf;      /* f there; 3e38: no sample */
+    float sdf;      /* f there, 0 at a hit; 3e38: no sample */
     int status;     /* DIST_RAY_* */
 } dist_hit;
 
@@ -681,7 +683,8 @@ DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *ta
    A target counts where it is finite and 0 < target < 1e5; mask may be NULL: then every pixel is a hit. What is not
    finite does not count: a loss does not tell that a code or a picture is spoiled. Nor does such a weight: 0. */
 
-/* mean |depth - target| over hit, observed pixels */
+/* mean |depth - target| over hit, observed pixels. A pixel that the shape does not cover has no say, and where none is
+   covered the loss is 0: dist_loss_silhouette beside it keeps the shape where it was seen. */
 DIST_API float dist_loss_depth(size_t n, const float *depth, const float *target, const unsigned char *mask,
                                float weight, float *d_depth);
 /* mean -(normal . target) over hit pixels whose target normal (n, 3) is finite and not 0; the target is normalized */
@@ -817,6 +820,7 @@ DIST_API dist_mesh *dist_mesh_read(dist_context *ctx, const void *bytes, size_t 
 DIST_API dist_status dist_mesh_write(dist_context *ctx, const dist_mesh *mesh, int format, void *buffer,
                                      size_t capacity, size_t *size);
 #ifndef DIST_NO_STDIO
+/* Positions and triangles: dist_mesh_read of the file. */
 DIST_API dist_mesh *dist_mesh_load(dist_context *ctx, const char *path);
 /* By the name's ending: .ply or .obj. */
 DIST_API dist_status dist_mesh_save(dist_context *ctx, const dist_mesh *mesh, const char *path);
@@ -8811,8 +8815,8 @@ static dist_status disti_camera_check(dist_context *ctx, const dist_camera *came
                           function, camera->width, camera->height);
     if (!disti_finite(camera->fx) || !disti_finite(camera->fy) || !(fabsf(camera->fx) > 1e-22f) ||
         !(fabsf(camera->fy) > 1e-22f)) /* their squares are to be above 0 */
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: camera.fx is %d, fy %d; must be finite and not 0 "
-                                                  "(1e-22 at least)",
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: camera.fx is %d, fy %d; must be finite and not 0 (1e-22 at "
+                                                  "least); dist_camera_look_at takes fov_y in radians, below pi",
                           function, (double)camera->fx, (double)camera->fy);
     const float other[4] = {camera->cx, camera->cy, camera->skew, camera->pixel_center};
     static const char named[4][46] = {"%s: camera.cx is %d, must be finite", "%s: camera.cy is %d, must be finite",
@@ -13509,7 +13513,7 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     int listed = disti_render_list(&tracer, &view, &job);
     job.count = listed ? listed : job.across * ((view.height + job.tile - 1) / job.tile);
     disti_sphere_box(&view, field, job.box);
-    job.warm = tracer.how.warm_start && !listed && disti_render_warms(&tracer, camera, tape);
+    job.warm = tape && tracer.how.warm_start && !listed && disti_render_warms(&tracer, camera, tape);
     job.step = (float)(6.0 * disti_view_footprint(&view, 1.0) * disti_view_away(&view, field));
     job.change = job.warm ? disti_render_change(&tracer, &view, tape) : 0.0f;
     if (!(job.change <= 4e-3f * field->radius)) job.warm = 0;

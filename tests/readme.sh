@@ -21,7 +21,7 @@ dist_field own_field(float axis[3]);
 int main(void)
 {
 END
-    sed -e '/^#/d' -e 's|"model.safetensors"|"examples/model.safetensors"|' "$work/1.txt"
+    sed -e '/^#/d' -e '/^dist_shape_destroy/d' -e 's|"model.safetensors"|"examples/model.safetensors"|' "$work/1.txt"
     cat <<'END'
 
     int hits = 0, bad = 0;
@@ -49,9 +49,9 @@ END
     memcpy(code, dist_net_code(net, 0), sizeof(float) * (size_t)dist_net_code_size(net));
     if (fit("examples/model.safetensors", code) != DIST_OK) bad++;
     if (fit("no such file", code) != DIST_IO) bad++;
-    return bad;
-}
 END
+    grep '^dist_shape_destroy' "$work/1.txt"
+    printf '    return bad;\n}\n'
 } >"$work/main.c"
 cp "$work/2.txt" "$work/fit.c"
 cp "$work/3.txt" "$work/more.c"

@@ -68,6 +68,14 @@ refuses a_demo_of_a_family_without_demo "they mean nothing" "$work/fit_depth" --
 refuses two_observations "two observations" "$work/fit_photos" --photos none.txt --target 1 --out "$work/x"
 refuses starts_off_below_0 "0 to 180 degrees" "$work/fit_pose" --off -1,0 --out "$work/x"
 refuses starts_off_too_far "a distance of 0 to 1000" "$work/fit_pose" --off 5,1e9 --out "$work/x"
+refuses a_fit_of_what_is_not_seen "nothing to fit" "$work/fit_depth" --demo --no-mask --weights 0,1,0 --out "$work/x"
+refuses a_code_that_is_no_word "no INDEX" "$work/render" embedded --code nan --out "$work/x"
+refuses a_folder_as_a_stem "is a folder" "$work/render" embedded --out "$work"
+refuses options_without_effect "belongs to" "$work/fit_photos" --mesh-cells 20 --out "$work/x"
+refuses starts_of_no_similarity "where --similarity starts" "$work/fit_photos" --off 5,5,0.1 --out "$work/x"
+refuses lengths_that_differ "three ways" "$work/train" --steps 2 --epochs 2 --out "$work/x"
+refuses an_output_that_cannot_be "cannot be written" "$work/train" --steps 2 --out "$work"
+refuses arguments_where_there_are_none "takes no arguments" "$work/hello" --size 8
 ls "$work"/x* >"$work/found" 2>/dev/null
 expect_nothing refusals_write_no_file "$work/found"
 for file in bench/*.c; do

@@ -3021,7 +3021,8 @@ static void disti_few_avx512(const disti_few *g)
     else if (g->points <= 10) disti_few_ten_avx512(g);
     else disti_few_twelve_avx512(g);
 }
-static const disti_part disti_parts_avx512[] = {{13, 24, 12}, {33, 48, 32}, {0, 0, 0}};
+static const disti_part disti_parts_avx512[] = {{13, 24, 12}, {33, 44, 32}, {49, 56, 32},
+                                                {57, 60, 48}, {61, 1 << 30, 32}, {0, 0, 0}};
 #undef DISTI_ABS
 #undef DISTI_GREATER
 #undef DISTI_TWO
@@ -6521,14 +6522,15 @@ static int disti_net_few(const dist_shape *shape, const disti_block *b, size_t n
            net->layers > 1 && !shape->ctx->blas.sgemm_fn;
 }
 
-/* How many of up to a block's points are evaluated next: some counts go faster as parts, one of them of few points,
-   where a layer is long enough to pay for a second pass over it. */
+/* How many of the n points that are left are evaluated next, at most a block: some counts go faster as parts, one of them
+   of few points, where a layer is long enough to pay for a second pass over it. */
 static size_t disti_net_part(const dist_shape *shape, const disti_block *b, size_t n)
 {
     const disti_part *part = b->kernels.parts;
-    if (!part || !b->values || !shape->wide || !disti_net_few(shape, b, (size_t)b->kernels.few_points)) return n;
+    size_t block = DISTI_MIN(n, (size_t)DISTI_BLOCK);
+    if (!part || !b->values || !shape->wide || !disti_net_few(shape, b, (size_t)b->kernels.few_points)) return block;
     while (part->least && n > (size_t)part->most) part++;
-    return part->least && n >= (size_t)part->least ? (size_t)part->points : n;
+    return part->least && n >= (size_t)part->least ? (size_t)part->points : block;
 }
 
 /* disti_net_forward of a few points: activations stand (points, max_rows), so that weights fill the vectors. The last
@@ -6847,7 +6849,7 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
         if (j < blocks) {
             disti_group_block(net, &g, j, &b);
         } else {
-            count = disti_net_part(shape, &b, count);
+            count = disti_net_part(shape, &b, n - at);
             disti_block_load(shape, &b, count, points + 3 * at);
             const float *x = disti_net_few(shape, &b, count) ? disti_few_forward(shape, &b, counter)
                                                              : disti_net_forward(shape, &b, NULL, counter);

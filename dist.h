@@ -6522,8 +6522,8 @@ static int disti_net_few(const dist_shape *shape, const disti_block *b, size_t n
            net->layers > 1 && !shape->ctx->blas.sgemm_fn;
 }
 
-/* How many of the n points that are left are evaluated next, at most a block: some counts go faster as parts, one of them
-   of few points, where a layer is long enough to pay for a second pass over it. */
+/* How many of the n points that are left are evaluated next, at most a block: some counts go faster as parts, one of
+   them of few points, where a layer is long enough to pay for a second pass over it. */
 static size_t disti_net_part(const dist_shape *shape, const disti_block *b, size_t n)
 {
     const disti_part *part = b->kernels.parts;

@@ -9001,7 +9001,7 @@ typedef struct disti_ray {
     float off;             /* of a hit: how far the neighbors' prediction was from it; 0: there was none */
     unsigned char kept;  /* warm start: verified, not traced; a miss's best is where |f| is least */
     unsigned char own;   /* incline is df/ds at q: the sample came with its gradient; of a hit: it is the normal's */
-    float stop;          /* warm start: start as the cones left it */
+    float stop;          /* warm start: start as the cones left it; leave if they cleared it */
 } disti_ray;
 
 enum {
@@ -9591,7 +9591,8 @@ static int disti_ray_band(const disti_tracer *tracer, disti_ray *ray, float f)
         return disti_ray_step(tracer, ray);
     }
     if (tracer->how.certified) { /* on until the steps are spent */
-        int last = ray->steps + 1 >= tracer->how.max_steps && !(change >= 1e-3f * all);
+        int flat = change < 1e-3f * all && change > -1e-3f * all && slope < 1e-3f; /* neither falling nor rising */
+        int last = ray->steps + 1 >= tracer->how.max_steps && flat;
         return last ? disti_ray_end(ray, DIST_RAY_PLATEAU, ray->s, f, 0.0f) : disti_ray_feel(tracer, ray, epsilon);
     }
     if (ray->side >= 16 && !(change >= 1e-3f * all)) return disti_ray_end(ray, DIST_RAY_PLATEAU, ray->s, f, 0.0f);
@@ -12721,6 +12722,7 @@ static int disti_warm_pass(const disti_warm *warm, disti_ray *ray, float f, floa
         float curvature = ray->fa - 2.0f * ray->f + f, rise = DISTI_MAX(ray->fa, f) - ray->f;
         float drop = curvature > 0.0f ? (ray->fa - f) * (ray->fa - f) / (8.0f * curvature) : 0.0f;
         float q = ray->s + disti_parabola(ray->width, ray->fa, ray->f, f);
+        q = DISTI_MIN(DISTI_MAX(q, ray->enter), ray->leave);
         int convex = ray->f - rise > DISTI_MAX(0.5f * ray->f, 2.0f * warm->tracer->noise); /* above its chords, too */
         if (convex || ray->f - drop - 0.25f * rise > DISTI_MAX(least, ray->moved ? 0.0f : 0.5f * ray->f)) {
             ray->s = q;
@@ -12742,7 +12744,7 @@ static int disti_warm_pass(const disti_warm *warm, disti_ray *ray, float f, floa
     }
     ray->side = 0;
     if (ray->steps > 24 || ray->s <= ray->enter || ray->s >= ray->leave) return -1;
-    return disti_ray_ask(ray, DISTI_WAIT, ray->s - ray->width);
+    return disti_ray_ask(ray, DISTI_WAIT, DISTI_MAX(ray->s - ray->width, ray->enter));
 }
 
 /* Ray i passes close by a surface or runs into it: from ray->s, f on, first to where spheres of as much room on both
@@ -13339,7 +13341,10 @@ static void disti_render_task(void *arg, int index, int worker)
             return;
         }
         budget.marching = 1;
-        for (int i = 0; i < n && job->tape; i++) bench.rays[i].stop = bench.rays[i].start;
+        for (int i = 0; i < n && job->tape; i++) {
+            disti_ray *ray = &bench.rays[i];
+            ray->stop = ray->mode == DISTI_DONE && ray->enter < ray->leave ? ray->leave : ray->start; /* cleared */
+        }
         float steepest = bench.stats->steepest;
         bench.stats->steepest = 0.0f;
         if (job->warm) bench.cones = 0; /* its memory is put to another use */

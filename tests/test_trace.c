@@ -362,6 +362,42 @@ TEST(certified_rays_miss_nothing)
     dist_context_destroy(ctx);
 }
 
+/* A sphere that the z axis passes at *user, and one behind it that it meets at .3. */
+static void passed_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    const float x0 = -0.2f - *(const float *)user;
+    (void)worker;
+    (void)gradient;
+    for (size_t i = 0; i < n; i++) {
+        float x = points[3 * i], y = points[3 * i + 1], z = points[3 * i + 2];
+        float f = sqrtf((x - x0) * (x - x0) + y * y + z * z) - 0.2f;
+        float g = sqrtf(x * x + y * y + (z - 0.6f) * (z - 0.6f)) - 0.3f;
+        sdf[i] = f < g ? f : g;
+    }
+}
+
+/* Certified, the steps are spent while f rises again: that is no plateau. */
+TEST(a_certified_ray_along_which_f_rises_is_on_no_plateau)
+{
+    dist_context *ctx = shape_context();
+    for (int k = 0; k < 24; k++) {
+        float least = 8.5e-7f + 5e-8f * (float)k, origin[3] = {0, 0, -2}, direction[3] = {0, 0, 1};
+        dist_field field;
+        dist_render_desc how;
+        dist_hit hit;
+        memset(&field, 0, sizeof field);
+        memset(&how, 0, sizeof how);
+        field.user = &least;
+        field.eval_fn = passed_eval;
+        field.radius = 1;
+        how.certified = 1;
+        CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, 1, origin, direction, &how, &hit, NULL), ctx);
+        if (test_state.verbose) printf("    %.2e: status %d at %g\n", (double)least, hit.status, (double)hit.distance);
+        CHECK(hit.status == DIST_RAY_UNRESOLVED || hit.status == DIST_RAY_HIT);
+    }
+    dist_context_destroy(ctx);
+}
+
 /* A sheet about the plane y = 0 in front of a solid below it. */
 typedef struct test_sheet {
     float half, gap;
@@ -2060,6 +2096,7 @@ int main(int argc, char **argv)
     RUN(no_rod_thinner_than_a_pixel_is_missed);
     RUN(one_pixel_in_5000_of_a_rod_is_missed_by_large_pictures_and_none_certified);
     RUN(certified_rays_miss_nothing);
+    RUN(a_certified_ray_along_which_f_rises_is_on_no_plateau);
     RUN(no_sheet_before_a_solid_is_passed);
     RUN(no_wire_before_a_surface_is_passed_by_certified_pictures);
     RUN(one_hit_in_a_thousand_is_lost_of_random_thin_parts_and_none_certified);

@@ -151,6 +151,60 @@ TEST(what_comes_out_of_nothing_is_seen_at_once)
     }
 }
 
+/* A sphere that jumps to where the cones cleared whole blocks; with a silhouette their pixels have a least |f| above 0. */
+TEST(what_jumps_to_where_all_was_clear_is_seen_at_once)
+{
+    const float eye[3] = {0.4f, 0, 3}, at[3] = {0.4f, 0, 0}, hidden[4] = {0, 0.1f, 0, 0.1f},
+                there[4] = {0.9f, 0.1f, 0, 0.15f};
+    for (int silhouette = 0; silhouette < 2; silhouette++) {
+        scene s;
+        float radius = 0.3f;
+        scene_open(&s);
+        s.field.user = &radius;
+        s.field.eval_fn = pair_eval;
+        s.field.radius = 1.5f;
+        s.camera = dist_camera_look_at(SIDE, SIDE, 0.6f, eye, at, NULL);
+        for (int i = 0; i < 8; i++) {
+            memcpy(second, i < 4 ? hidden : there, sizeof second);
+            render(&s, 1, silhouette, &warm);
+            render(&s, 0, silhouette, &cold);
+            check_same(silhouette, 250);
+        }
+        scene_close(&s);
+    }
+}
+
+/* The camera stands .002 before a solid behind its back and beside another one. */
+TEST(what_lies_behind_the_camera_is_not_seen)
+{
+    const float eye[3] = {0, 0, 0.302f}, at[3] = {0, 0, 1}, beside[4] = {0.1f, 0, 0.352f, 0.1f};
+    for (int silhouette = 0; silhouette < 2; silhouette++) {
+        scene s;
+        float radius = 0.3f;
+        int behind = 0, other = 0, hits = 0;
+        scene_open(&s);
+        s.field.user = &radius;
+        s.field.eval_fn = pair_eval;
+        memcpy(second, beside, sizeof second);
+        s.camera = dist_camera_look_at(SIDE, SIDE, 1.2f, eye, at, NULL);
+        for (int i = 0; i < 6; i++) {
+            radius -= i == 3 ? 1e-4f : 0.0f;
+            render(&s, 1, silhouette, &warm);
+            render(&s, 0, silhouette, &cold);
+            for (int k = 0; k < PIXELS; k++) {
+                behind += warm.mask[k] && warm.distance[k] < 0;
+                other += warm.mask[k] != cold.mask[k];
+                hits += cold.mask[k];
+            }
+        }
+        if (test_state.verbose) printf("    %d behind, %d other than cold, of %d hits\n", behind, other, hits);
+        CHECK(hits > PIXELS / 2);
+        CHECK_EQUAL(0, behind);
+        CHECK(other * 1000 <= hits);
+        scene_close(&s);
+    }
+}
+
 /* A speck that comes out of nothing close above a surface, where f at the cones' stops does not betray it. */
 TEST(what_nothing_foretells_is_seen_when_its_turn_comes)
 {
@@ -397,6 +451,8 @@ int main(int argc, char **argv)
     RUN(a_hundred_small_steps_do_not_drift_and_cost_little);
     RUN(larger_steps_out_of_pixels_and_into_them_are_seen_at_once);
     RUN(what_comes_out_of_nothing_is_seen_at_once);
+    RUN(what_jumps_to_where_all_was_clear_is_seen_at_once);
+    RUN(what_lies_behind_the_camera_is_not_seen);
     RUN(what_nothing_foretells_is_seen_when_its_turn_comes);
     RUN(outlines_that_pass_each_other_are_followed);
     RUN(another_camera_or_field_is_a_cold_start);

@@ -9591,7 +9591,7 @@ static int disti_ray_band(const disti_tracer *tracer, disti_ray *ray, float f)
         return disti_ray_step(tracer, ray);
     }
     if (tracer->how.certified) { /* on until the steps are spent */
-        int flat = change < 1e-3f * all && change > -1e-3f * all && slope < 1e-3f; /* neither falling nor rising */
+        int flat = change < 1e-3f * all && f <= 1.25f * fabsf(ray->fbest); /* neither falls nor has risen */
         int last = ray->steps + 1 >= tracer->how.max_steps && flat;
         return last ? disti_ray_end(ray, DIST_RAY_PLATEAU, ray->s, f, 0.0f) : disti_ray_feel(tracer, ray, epsilon);
     }

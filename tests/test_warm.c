@@ -151,7 +151,7 @@ TEST(what_comes_out_of_nothing_is_seen_at_once)
     }
 }
 
-/* A sphere that jumps to where the cones cleared whole blocks; with a silhouette their pixels have a least |f| above 0. */
+/* A sphere that jumps to where the cones cleared whole blocks; with a silhouette these pixels' least |f| is above 0. */
 TEST(what_jumps_to_where_all_was_clear_is_seen_at_once)
 {
     const float eye[3] = {0.4f, 0, 3}, at[3] = {0.4f, 0, 0}, hidden[4] = {0, 0.1f, 0, 0.1f},

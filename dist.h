@@ -187,7 +187,7 @@ typedef struct dist_field {
     /* sdf[i] = f(points[i]) for n points (n, 3); gradient (n, 3) is NULL or gets df/dpoint.
        Called from several workers at once; worker is 0..dist_context_workers-1. */
     void (*eval_fn)(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient);
-    /* d_code[j] += sum over i of d_sdf[i] * df(points[i])/dcode[j]. NULL: this field has no code. */
+    /* d_code[j] += sum over i of d_sdf[i] * df(points[i])/dcode[j]. NULL: there is no code, or fused_fn is set. */
     void (*adjoint_fn)(void *user, int worker, size_t n, const float *points, const float *d_sdf, double *d_code);
     /* Set by dist_shape_field, NULL in a field of your own: value, gradient and code adjoint in one pass, and the
        weights'. */
@@ -2518,29 +2518,32 @@ DISTI_PLAIN(scalar, static)
         DISTI_Y##R(DISTI_SOME_STORE, V)                                                                                \
     }
 
-/* k: the rows of this tile; from `count` on they repeat the last one and are not stored. */
-#define DISTI_OFFSET(i, V) const size_t k##i = (size_t)(unsigned)k[i] * 8;
+/* k: the rows of this tile; from `count` on they repeat the last one and are not stored. NULL: those from `first` on,
+   whose places the compiler then knows. */
+#define DISTI_LISTED(i, V) const size_t k##i = (size_t)(unsigned)k[i] * 8;
+#define DISTI_NEXT(i, V) const size_t k##i = (i) * 8;
 #define DISTI_RETURN1(i, j) a##i##j = DISTI_LOAD(d_x + k##i * (DISTI_BLOCK / 8) + j * DISTI_LANES);
 #define DISTI_RETURN(i, V) DISTI_X##V(DISTI_RETURN1, i)
 #define DISTI_STORE_KEEP1(i, j)                                                                                        \
     DISTI_STORE(d_x + k##i * (DISTI_BLOCK / 8) + j * DISTI_LANES, DISTI_KEEP(a##i##j, bits >> (j * DISTI_LANES)));
 #define DISTI_STORE_KEEP(i, V)                                                                                         \
     if (i < count) {                                                                                                   \
-        const uint64_t bits = g->mask ? g->mask[k[i]] >> c : ~(uint64_t)0;                                             \
+        const uint64_t bits = mask ? mask[k##i / 8] >> c : ~(uint64_t)0;                                               \
         DISTI_X##V(DISTI_STORE_KEEP1, i)                                                                               \
     }
 #define DISTI_STORE_SOON1(i, j) DISTI_STORE(d_x + k##i * (DISTI_BLOCK / 8) + j * DISTI_LANES, a##i##j);
 #define DISTI_STORE_SOON(i, V) if (i < count) { DISTI_X##V(DISTI_STORE_SOON1, i) }
 
-#define DISTI_BACK_TILE(name, R, V)                                                                                    \
-    DISTI_NOINLINE DISTI_FUNCTION void disti_back_##name(const disti_gemm_back *g, const int *k, int count, int c,     \
-                                                          int from, int to)                                            \
+#define DISTI_BACK_TILE(name, R, V, PLACES)                                                                            \
+    DISTI_NOINLINE DISTI_FUNCTION void disti_back_##name(const disti_gemm_back *g, const int *k, int first, int count, \
+                                                          int c, int from, int to)                                     \
     {                                                                                                                  \
-        const float *weights = g->weights, *d_y = g->d_y + c;                                                          \
-        const size_t panel = (size_t)g->rows * 8;                                                                      \
-        const float *next = weights + (size_t)(unsigned)k[R - 1] * 8 + 8;                                              \
-        float *d_x = g->d_x + c;                                                                                       \
-        DISTI_Y##R(DISTI_OFFSET, V)                                                                                    \
+        const size_t panel = (size_t)g->rows * 8, at = (size_t)(unsigned)first;                                        \
+        const float *weights = g->weights + at * 8, *d_y = g->d_y + c;                                                 \
+        const float *next = k ? weights + (size_t)(unsigned)k[R - 1] * 8 + 8 : weights + R * 8;                        \
+        const uint64_t *mask = g->mask ? g->mask + at : NULL;                                                          \
+        float *d_x = g->d_x + at * DISTI_BLOCK + c;                                                                    \
+        DISTI_Y##R(PLACES, V)                                                                                          \
         DISTI_Y##R(DISTI_ZERO, V)                                                                                      \
         if (from > 0) {                                                                                                \
             DISTI_Y##R(DISTI_RETURN, V)                                                                                \
@@ -2725,13 +2728,16 @@ DISTI_PLAIN(scalar, static)
     {                                                                                                                  \
         const int rows = g->alive_rows ? g->alive_rows_count : g->rows;                                                \
         const int count = g->alive_out ? g->alive_out_count : g->out;                                                  \
+        const int next = g->alive_rows || g->columns % (W * DISTI_LANES) != 0 ? 0 : rows / 8 * 8;                      \
         int to = 0, k[8];                                                                                              \
         do {                                                                                                           \
             const int from = to;                                                                                       \
             to = DISTI_UNTIL(from, count);                                                                             \
             DISTI_FEW(isa)                                                                                             \
-            DISTI_EACH(back, isa, 0, rows, g->columns, R, W,                                                           \
-                       (g, disti_back_rows(g, rows, n, k), rows - n, c, from, to))                                     \
+            for (int c = 0; c < g->columns && next > 0; c += W * DISTI_LANES)                                          \
+                for (int n = 0; n < next; n += R) disti_back_next_##isa(g, NULL, n, R, c, from, to);                   \
+            DISTI_EACH(back, isa, next, rows, g->columns, R, W,                                                        \
+                       (g, disti_back_rows(g, rows, n, k), 0, rows - n, c, from, to))                                  \
         } while (to < count);                                                                                          \
     }                                                                                                                  \
     DISTI_FUNCTION void disti_gemm_weights_##isa(const disti_gemm_weights *g)                                          \
@@ -2838,9 +2844,10 @@ DISTI_PLAIN(scalar, static)
     DISTI_SOME_TILE(wide_##isa, R, W)                                                                                  \
     DISTI_SOME_TILE(middle_##isa, R, 2)                                                                                \
     DISTI_SOME_TILE(narrow_##isa, 8, 1)                                                                                \
-    DISTI_BACK_TILE(wide_##isa, R, W)                                                                                  \
-    DISTI_BACK_TILE(middle_##isa, R, 2)                                                                                \
-    DISTI_BACK_TILE(narrow_##isa, 8, 1)                                                                                \
+    DISTI_BACK_TILE(wide_##isa, R, W, DISTI_LISTED)                                                                    \
+    DISTI_BACK_TILE(middle_##isa, R, 2, DISTI_LISTED)                                                                  \
+    DISTI_BACK_TILE(narrow_##isa, 8, 1, DISTI_LISTED)                                                                  \
+    DISTI_BACK_TILE(next_##isa, R, W, DISTI_NEXT)                                                                      \
     DISTI_WEIGHTS_TILE(wide_##isa, R, W)                                                                               \
     DISTI_WEIGHTS_TILE(middle_##isa, R, 2)                                                                             \
     DISTI_WEIGHTS_TILE(narrow_##isa, 8, 1)                                                                             \
@@ -2994,10 +3001,10 @@ static const disti_part disti_parts_avx2[] = {{9, 18, 6}, {25, 30, 24}, {33, 40,
 DISTI_GEMM_TILE(tall_avx512, 16, 1, DISTI_ABOVE)
 #define DISTI_FEW(isa)                                                                                                 \
     if (rows > 0 && rows <= 4 && g->columns > 2 * DISTI_LANES) {                                                       \
-        disti_back_few_##isa(g, disti_back_rows(g, rows, 0, k), rows, 0, from, to);                                    \
+        disti_back_few_##isa(g, disti_back_rows(g, rows, 0, k), 0, rows, 0, from, to);                                 \
         continue;                                                                                                      \
     }
-DISTI_BACK_TILE(few_avx512, 4, 3)
+DISTI_BACK_TILE(few_avx512, 4, 3, DISTI_LISTED)
 #define DISTI_GREATER(a, b) _mm512_maskz_max_ps((__mmask16)0xffff, a, b)
 #define DISTI_ABS(v) _mm512_andnot_ps(_mm512_set1_ps(-0.0f), v)
 #define DISTI_TWO(p, q) \
@@ -3425,7 +3432,8 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_STORE_SUM
 #undef DISTI_STORE_RELU
 #undef DISTI_GEMM_TILE
-#undef DISTI_OFFSET
+#undef DISTI_LISTED
+#undef DISTI_NEXT
 #undef DISTI_RETURN1
 #undef DISTI_RETURN
 #undef DISTI_STORE_SOON1

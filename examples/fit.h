@@ -315,6 +315,12 @@ static inline double chamfer_between(dist_context *ctx, const float *a, const fl
     return chamfer;
 }
 
+/* A word at the end of a fit that has found nothing better than its start. */
+static inline void tell_if_not_fallen(double start, double end, double rate)
+{
+    if (!(end < start)) { printf("the loss has not fallen: try a --rate below %g, or another start\n", rate); }
+}
+
 static inline void json_score(json *j, const char *name, const char *when, double value)
 {
     char key[64];

@@ -331,6 +331,7 @@ static void fit_and_report(fit *f, const float *target_points, const size_t *byt
     print_row("depth error", scores[0].depth_error, scores[1].depth_error);
     print_row("mask IoU", scores[0].iou, scores[1].iou);
     print_row("Chamfer", scores[0].chamfer, scores[1].chamfer);
+    tell_if_not_fallen(scores[0].loss, scores[1].loss, (double)o->rate);
     dist_mesh_destroy(mesh);
     if (f->out.error) {
         dist_shape_set_code(f->shape, f->code); /* write_strip has shown others */

@@ -673,6 +673,7 @@ static void run_one(dist_context *ctx, const dist_net *net, request *r)
         print_row("rotation, degrees", start.degrees, end.degrees);
         print_row("translation", start.distance, end.distance);
     }
+    tell_if_not_fallen(start.loss, end.loss, (double)r->fit.rate);
     free(records);
     free(code);
     fit_destroy(&f);

@@ -37,6 +37,15 @@ reports() {
 }
 expect render_reports reports "$work/render" embedded --size 48
 expect fit_depth_reports reports "$work/fit_depth" --demo --size 32 --iterations 2
+# A fit says whether it has come to nothing: RATE RISEN.
+fit_says() {
+    risen=0
+    "$work/fit_depth" --demo --size 32 --iterations 8 --rate "$1" --out "$work/rate" >"$work/said" || return
+    grep -q "the loss has not fallen: try a --rate below $1," "$work/said" && risen=1
+    [ "$risen" = "$2" ] || { cat "$work/said"; return 1; }
+}
+expect a_fit_that_diverges_says_so fit_says 10 1
+expect a_fit_that_falls_says_no_such_thing fit_says 0.01 0
 # What cannot be done is refused with a sentence, and nothing else happens: NAME WORDS COMMAND...
 refuses() {
     refused=$1 words=$2

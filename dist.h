@@ -237,6 +237,10 @@ typedef struct dist_field {
        dist_shape_field and dist_scene_field, whose functions give 0 where eval_fn is not theirs any more; NULL: that is
        not looked at */
     unsigned (*changes_fn)(const struct dist_field *field);
+    /* 1: since the field was taken the shape, or one of the scene's, has got another texture, so its color is refused.
+       Set likewise; NULL: that is not looked at */
+    int (*stale_fn)(const struct dist_field *field);
+    unsigned textures; /* how often it had got one then */
     const struct dist_cache *cache; /* set by dist_cache_field; NULL: none */
 } dist_field;
 
@@ -432,7 +436,7 @@ DIST_API dist_status dist_shape_set_code(dist_shape *shape, const float *code);
 /* Color by a second net: rgb = g(code, color code, point), where g's code is the shape's followed by the color's; so
    dist_net_code_size(texture) is at least the shape's, and the rest is field.color_code_size. color_code is copied;
    NULL means zeros. The net is borrowed until the shape is destroyed or gets another texture; texture NULL takes it
-   away. Fields taken before must be taken again. dist_shape_set_code sets the code of both nets. */
+   away. Fields taken before must be taken again, their color is refused. dist_shape_set_code sets the code of both. */
 DIST_API dist_status dist_shape_set_texture(dist_shape *shape, const dist_net *texture, const float *color_code);
 DIST_API dist_status dist_shape_set_color_code(dist_shape *shape, const float *color_code);
 /* The field of the net's distance channel. Borrows the shape. A net without one (r,g,b) gives a field that render
@@ -3791,6 +3795,11 @@ static unsigned disti_changes(const dist_field *field)
     return field->changes_fn ? field->changes_fn(field) : 0;
 }
 
+static int disti_stale(const dist_field *field)
+{
+    return field->stale_fn && field->stale_fn(field);
+}
+
 /* The figure from |f| = disti_far_from on. */
 static float disti_lipschitz_far(const dist_field *field)
 {
@@ -3945,6 +3954,9 @@ static dist_status disti_color_check(dist_context *ctx, const dist_field *field,
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.code_size is %d, color_code_size %d, must not be negative",
                           function, field->code_size, field->color_code_size);
     if (field->owner && field->owner != ctx) return disti_refuse(ctx, "%s: field belongs to another context", function);
+    if (disti_stale(field))
+        return disti_refuse(ctx, "%s: the field is older than its shape's texture; dist_shape_field gives a new one",
+                            function);
     return DIST_OK;
 }
 
@@ -4926,6 +4938,15 @@ static unsigned disti_scene_changes(const dist_field *field)
     return hash;
 }
 
+static int disti_scene_stale(const dist_field *field)
+{
+    const dist_scene *scene = (const dist_scene *)field->user;
+    int stale = 0;
+    for (int k = 0; field->eval_fn == disti_scene_eval && k < scene->count; k++)
+        stale |= disti_stale(&scene->placed[k].field);
+    return stale;
+}
+
 DIST_API dist_field dist_scene_field(dist_scene *scene)
 {
     dist_field field;
@@ -4934,6 +4955,7 @@ DIST_API dist_field dist_scene_field(dist_scene *scene)
     field.user = scene;
     field.owner = scene->ctx;
     field.changes_fn = disti_scene_changes;
+    field.stale_fn = disti_scene_stale;
     field.eval_fn = disti_scene_eval;
     field.fused_fn = disti_scene_fused;
     field.color_fn = disti_scene_color;
@@ -5878,6 +5900,7 @@ struct dist_shape {
     float half_error; /* largest of 16 bits at the samples of disti_shape_slope */
     int half;         /* what the net had then */
     unsigned changes; /* of the code, so far */
+    unsigned textures; /* that it got, so far */
     int groups;       /* disti_groups_pay */
     int wide;         /* its net's queries cost enough for one more look at a batch's points to pay */
     int many;         /* dist_field.many: two thirds or less of a block's multiply-adds are left with bounds */
@@ -7591,6 +7614,12 @@ static unsigned disti_shape_changes(const dist_field *field)
     return shape->changes + shape->net->changes;
 }
 
+static int disti_shape_stale(const dist_field *field)
+{
+    if (field->eval_fn && field->eval_fn != disti_shape_eval_fn && field->eval_fn != field->coarse_fn) return 0;
+    return field->textures != ((const dist_shape *)field->user)->textures;
+}
+
 DIST_API dist_field dist_shape_field(dist_shape *shape)
 {
     dist_field field;
@@ -7600,6 +7629,8 @@ DIST_API dist_field dist_shape_field(dist_shape *shape)
     field.user = shape;
     field.owner = shape->ctx;
     field.changes_fn = disti_shape_changes;
+    field.stale_fn = disti_shape_stale;
+    field.textures = shape->textures;
     if (net->sdf_channel >= 0) {
         field.eval_fn = disti_shape_eval_fn;
         field.fused_fn = disti_shape_fused;
@@ -7805,6 +7836,7 @@ DIST_API dist_status dist_shape_set_texture(dist_shape *shape, const dist_net *t
     }
     dist_shape_destroy(shape->texture);
     shape->texture = paint;
+    shape->textures++;
     return DIST_OK;
 }
 
@@ -13501,6 +13533,8 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
         return disti_refuse(ctx, "%s: how.any_hit and max_distance are for dist_trace", name);
     if (out->color && !field->color_fn)
         return disti_fail(ctx, DIST_UNSUPPORTED, "%s: out.color is wanted, but the field has no color", name, 0, 0);
+    if (out->color) status = disti_color_check(ctx, field, 0, name);
+    if (status != DIST_OK) return status;
     if (tape && tape->ctx != ctx) return disti_refuse(ctx, "%s: tape belongs to another context", name);
     if (tape && (tape->width != camera->width || tape->height != camera->height))
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: tape is for another size than camera.width %d, height %d", name,

@@ -631,6 +631,40 @@ TEST(codes_of_a_textured_shape_are_set_one_by_one)
     scene_close(&t);
 }
 
+TEST(color_of_a_field_that_is_older_than_its_texture_is_refused)
+{
+    static pictures a;
+    const float point[3] = {0.2f, 0.3f, -0.4f};
+    scene s;
+    float color[3], sdf;
+    scene_open(&s, 0, 1);
+    dist_instance instance;
+    memset(&instance, 0, sizeof instance);
+    instance.field = &s.field;
+    dist_scene *all = dist_scene_create(s.ctx, 1, &instance);
+    dist_field both[2] = {s.field, dist_scene_field(all)};
+    dist_images out;
+    memset(&out, 0, sizeof out);
+    out.color = a.color;
+    for (int again = 0; again < 2; again++) {
+        for (int k = 0; k < 2; k++) {
+            CHECK_STATUS(DIST_OK, dist_field_eval(s.ctx, &both[k], 1, point, &sdf, NULL), s.ctx); /* always */
+            dist_status status = dist_color_eval(s.ctx, &both[k], 1, point, color);
+            CHECK_STATUS(again ? DIST_BAD_ARGUMENT : DIST_OK, status, s.ctx);
+            if (again) CHECK(strstr(dist_context_message(s.ctx), "older than its shape's texture") != NULL);
+            dist_context_clear(s.ctx);
+            status = dist_render(s.ctx, &both[k], &s.camera, NULL, &out, NULL);
+            CHECK_STATUS(again ? DIST_BAD_ARGUMENT : DIST_OK, status, s.ctx);
+            dist_context_clear(s.ctx);
+        }
+        CHECK_STATUS(DIST_OK, dist_shape_set_texture(s.painted, s.net[1], NULL), s.ctx);
+    }
+    s.field = dist_shape_field(s.painted);
+    CHECK_STATUS(DIST_OK, dist_color_eval(s.ctx, &s.field, 1, point, color), s.ctx);
+    dist_scene_destroy(all);
+    scene_close(&s);
+}
+
 TEST(memory_refused_to_a_texture_leaves_the_shape_as_it_was)
 {
     model m = model_make(&pairs[0].shape, 70u), t = model_make(&pairs[0].texture, 90u);
@@ -894,6 +928,7 @@ int main(int argc, char **argv)
     RUN(color_gradients_have_the_same_bits_for_every_number_of_workers_and_whatever_else_is_wanted);
     RUN(color_queries_are_counted_and_none_made_where_no_color_is_asked_for);
     RUN(codes_of_a_textured_shape_are_set_one_by_one);
+    RUN(color_of_a_field_that_is_older_than_its_texture_is_refused);
     RUN(memory_refused_to_a_texture_leaves_the_shape_as_it_was);
     RUN(a_texture_that_does_not_fit_and_gradients_that_are_not_there_are_refused);
     RUN(a_texture_net_is_created_saved_and_trained);

@@ -238,7 +238,7 @@ typedef struct dist_field {
        not looked at */
     unsigned (*changes_fn)(const struct dist_field *field);
     /* 1: since the field was taken the shape, or one of the scene's, has got another texture, so its color is refused.
-       Set likewise; NULL: that is not looked at */
+       Set likewise, 0 where color_fn is not theirs any more; NULL: that is not looked at */
     int (*stale_fn)(const struct dist_field *field);
     unsigned textures; /* how often it had got one then */
     const struct dist_cache *cache; /* set by dist_cache_field; NULL: none */
@@ -3955,7 +3955,7 @@ static dist_status disti_color_check(dist_context *ctx, const dist_field *field,
                           function, field->code_size, field->color_code_size);
     if (field->owner && field->owner != ctx) return disti_refuse(ctx, "%s: field belongs to another context", function);
     if (disti_stale(field))
-        return disti_refuse(ctx, "%s: the field is older than its shape's texture; dist_shape_field gives a new one",
+        return disti_refuse(ctx, "%s: the field, or one in its scene, is older than its shape's texture; take it anew",
                             function);
     return DIST_OK;
 }
@@ -4942,7 +4942,7 @@ static int disti_scene_stale(const dist_field *field)
 {
     const dist_scene *scene = (const dist_scene *)field->user;
     int stale = 0;
-    for (int k = 0; field->eval_fn == disti_scene_eval && k < scene->count; k++)
+    for (int k = 0; field->color_fn == disti_scene_color && k < scene->count; k++)
         stale |= disti_stale(&scene->placed[k].field);
     return stale;
 }
@@ -7616,8 +7616,7 @@ static unsigned disti_shape_changes(const dist_field *field)
 
 static int disti_shape_stale(const dist_field *field)
 {
-    if (field->eval_fn && field->eval_fn != disti_shape_eval_fn && field->eval_fn != field->coarse_fn) return 0;
-    return field->textures != ((const dist_shape *)field->user)->textures;
+    return field->color_fn == disti_shape_color_fn && field->textures != ((const dist_shape *)field->user)->textures;
 }
 
 DIST_API dist_field dist_shape_field(dist_shape *shape)
@@ -9631,7 +9630,8 @@ static int disti_ray_band(const disti_tracer *tracer, disti_ray *ray, float f)
         return disti_ray_step(tracer, ray);
     }
     if (tracer->how.certified) { /* on until the steps are spent */
-        int flat = change < 1e-3f * all && f <= 1.25f * fabsf(ray->fbest); /* neither falls nor has risen */
+        float rise = f - fabsf(ray->fbest); /* beyond the rounding of numbers of the radius's size: no plateau */
+        int flat = change < 1e-3f * all && rise <= 1.2e-7f * tracer->field->radius;
         int last = ray->steps + 1 >= tracer->how.max_steps && flat;
         return last ? disti_ray_end(ray, DIST_RAY_PLATEAU, ray->s, f, 0.0f) : disti_ray_feel(tracer, ray, epsilon);
     }
@@ -13531,8 +13531,6 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     if (!out) return disti_refuse(ctx, "%s: out is NULL", name);
     if (tracer.how.any_hit || tracer.how.max_distance > 0.0f)
         return disti_refuse(ctx, "%s: how.any_hit and max_distance are for dist_trace", name);
-    if (out->color && !field->color_fn)
-        return disti_fail(ctx, DIST_UNSUPPORTED, "%s: out.color is wanted, but the field has no color", name, 0, 0);
     if (out->color) status = disti_color_check(ctx, field, 0, name);
     if (status != DIST_OK) return status;
     if (tape && tape->ctx != ctx) return disti_refuse(ctx, "%s: tape belongs to another context", name);

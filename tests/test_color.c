@@ -646,12 +646,18 @@ TEST(color_of_a_field_that_is_older_than_its_texture_is_refused)
     dist_images out;
     memset(&out, 0, sizeof out);
     out.color = a.color;
+    static float g[MOST];
+    dist_gradients grads = gradients_of(&s, g);
+    dist_tape *tape = pictures_take(&a, &s);
     for (int again = 0; again < 2; again++) {
+        dist_status back = dist_render_backward(s.ctx, tape, &a.d_out, &grads);
+        CHECK_STATUS(again ? DIST_BAD_ARGUMENT : DIST_OK, back, s.ctx);
+        dist_context_clear(s.ctx);
         for (int k = 0; k < 2; k++) {
             CHECK_STATUS(DIST_OK, dist_field_eval(s.ctx, &both[k], 1, point, &sdf, NULL), s.ctx); /* always */
             dist_status status = dist_color_eval(s.ctx, &both[k], 1, point, color);
             CHECK_STATUS(again ? DIST_BAD_ARGUMENT : DIST_OK, status, s.ctx);
-            if (again) CHECK(strstr(dist_context_message(s.ctx), "older than its shape's texture") != NULL);
+            if (again) CHECK(strstr(dist_context_message(s.ctx), "is older than its shape's texture") != NULL);
             dist_context_clear(s.ctx);
             status = dist_render(s.ctx, &both[k], &s.camera, NULL, &out, NULL);
             CHECK_STATUS(again ? DIST_BAD_ARGUMENT : DIST_OK, status, s.ctx);
@@ -661,6 +667,7 @@ TEST(color_of_a_field_that_is_older_than_its_texture_is_refused)
     }
     s.field = dist_shape_field(s.painted);
     CHECK_STATUS(DIST_OK, dist_color_eval(s.ctx, &s.field, 1, point, color), s.ctx);
+    dist_tape_destroy(tape);
     dist_scene_destroy(all);
     scene_close(&s);
 }

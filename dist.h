@@ -221,6 +221,9 @@ typedef struct dist_field {
     float radius;    /* 1e-15 to 1e15 */
     float lipschitz;     /* bound or estimate of |grad f| where 0 < f < clamp / 2 (no clamp: radius / 20); 0: 1 */
     float lipschitz_far; /* the same where f is larger; 0: lipschitz */
+    /* how.certified goes by these where they are larger than the two before, which may be those of most places: of a
+       net by the steepest place that dist_shape_create found */
+    float certified, certified_far;
     float clamp;     /* |f| above this carries no distance (a clamped training); 0: none */
     float detail;    /* the radius that the defaults of how.epsilon and normal_delta go by; 0: radius */
     /* multiply-adds of a query, about; a net's field has its own. Below 5000 a picture without silhouette and tape is
@@ -498,7 +501,7 @@ enum {
 };
 
 typedef struct dist_render_desc {
-    int max_steps;       /* queries per ray at most, to 60000; 0: 100 guarded, 1000 certified, 50 paper */
+    int max_steps;       /* queries per ray at most, to 60000; 0: 100 guarded, 10000 certified, 50 paper */
     float step_scale;    /* alpha, above 0, to 100; 0: 1.5 (paper: rows aggressive and coarse-to-fine) */
     float epsilon; /* largest |f| of a hit, shape units, which those interpolated between hits alike may exceed; 0: 5e-5
                       of the bounding radius or field.detail, or less where a pixel is smaller (paper: 5e-5). The
@@ -520,9 +523,10 @@ typedef struct dist_render_desc {
                          without a mask; 0: off */
     int no_cones;        /* 1: every ray marches from the bounding sphere by itself */
     int no_prediction;   /* 1: no ray starts from what its neighbors found */
-    int certified;       /* 1: only steps that the Lipschitz figures prove, for up to five times the queries; nothing
-                            is missed, nor seen by more than epsilon too far away, where these are bounds: a net's are
-                            sampled, dist_stats.steepest says when they were too small */
+    int certified;       /* 1: only steps that the Lipschitz figures prove, field.certified where that is larger, for
+                            three to eight times the queries, more where f stays small beside outlines; nothing is
+                            missed, nor seen by more than epsilon too far away, where they are bounds: a net's are the
+                            steepest slopes sampled, dist_stats.steepest says when these were too small */
     /* dist_trace only. any_hit 1: a ray ends as soon as anything is certain to block it, for shadows; its distance is
        then that of a sample inside what blocks, its error how far before that it goes in. max_distance: how far a ray
        looks, in lengths of its direction (1: from origin to origin + direction); 0: without end */
@@ -600,7 +604,8 @@ DIST_API dist_cache *dist_cache_create(dist_context *ctx, const dist_field *fiel
 DIST_API void dist_cache_destroy(dist_cache *cache);
 /* The field with its cache, to be traced instead of it. Borrows both. As soon as the shape's code, the net's weights or
    the scene have changed every call refuses it; a field of your own without changes_fn must not change. A cache serves
-   Lipschitz figures up to those it was made with: raise field.lipschitz before, not how.lipschitz for dist_trace. */
+   Lipschitz figures up to those it was made with: raise field.lipschitz before, not how.lipschitz for dist_trace; and
+   to field.certified, for how.certified, which makes no use of the cache otherwise. */
 DIST_API dist_field dist_cache_field(const dist_cache *cache);
 /* Makes it anew for a field that has changed, or another one; then take dist_cache_field again. No allocator call. */
 DIST_API dist_status dist_cache_update(dist_cache *cache, const dist_field *field);
@@ -3847,6 +3852,8 @@ static dist_status disti_field_check(dist_context *ctx, const dist_field *field,
     const disti_limit limits[] = {
         {"field.lipschitz", (double)field->lipschitz, 0, 3e38}, {"field.detail", (double)field->detail, 0, 3e38},
         {"field.lipschitz_far", (double)field->lipschitz_far, 0, 3e38}, {"field.clamp", (double)field->clamp, 0, 3e38},
+        {"field.certified", (double)field->certified, 0, 3e38},
+        {"field.certified_far", (double)field->certified_far, 0, 3e38},
         {"field.cost", (double)field->cost, 0, 3e38}, {"field.code_size", (double)field->code_size, 0, 3e38},
         {"field.color_code_size", (double)field->color_code_size, 0, 3e38},
         {"field.coarse_error", (double)field->coarse_error, 0, 3e38}};
@@ -4972,6 +4979,8 @@ DIST_API dist_field dist_scene_field(dist_scene *scene)
         if (!(field.detail > 0.0f && field.detail < detail)) field.detail = detail;
         field.lipschitz = DISTI_MAX(field.lipschitz, f->lipschitz);
         field.lipschitz_far = DISTI_MAX(field.lipschitz_far, disti_steepest(f));
+        field.certified = DISTI_MAX(field.certified, f->certified);
+        field.certified_far = DISTI_MAX(field.certified_far, DISTI_MAX(f->certified, f->certified_far));
         if (clamp > 0.0f && !(field.clamp > 0.0f && field.clamp < clamp)) field.clamp = clamp;
         known = known && f->cost > 0.0f;
         field.cost = known ? DISTI_MIN(field.cost + f->cost, 2e38f) : 0.0f;
@@ -5896,7 +5905,7 @@ struct dist_shape {
     const dist_net *net;
     float *code;
     float *bias; /* (layers + 1, max_rows): each layer's bias with the code folded in; then zeros, for tangents */
-    float lipschitz, lipschitz_far;
+    float lipschitz, lipschitz_far, certified, certified_far;
     float half_error; /* largest of 16 bits at the samples of disti_shape_slope */
     int half;         /* what the net had then */
     unsigned changes; /* of the code, so far */
@@ -7543,14 +7552,15 @@ static int disti_groups_pay(dist_shape *shape, const float *points)
 }
 
 /* Sampled |grad f| outside the surface: the 4/5 quantile near it, 31/32 beyond disti_far_from, at least 1. What matters
-   is not the steepest spot but how far f exceeds the distance, which is its mean slope on the way. Half of the 768
-   points are those of a fixed low-discrepancy sequence (the plastic number's) in the bounding sphere, half are these
-   moved along their gradients to a place near the surface. Notes which layers meet no dead unit there, and what 16 bits
-   are off. */
+   is not the steepest spot but how far f exceeds the distance, which is its mean slope on the way; how.certified takes
+   the largest all the same. Half of the 768 points are those of a fixed low-discrepancy sequence (the plastic number's)
+   in the bounding sphere, half are these moved along their gradients to a place near the surface. Notes which layers
+   meet no dead unit there, and what 16 bits are off. */
 static void disti_shape_slope(dist_shape *shape, const dist_field *field)
 {
     enum { ROUNDS = 16, BINS = 256 };
     int bins[2][BINS], count[2] = {0, 0};
+    float most[2] = {1.0f, 1.0f};
     float points[3 * DISTI_BLOCK], sdf[DISTI_BLOCK], gradient[3 * DISTI_BLOCK], coarse[DISTI_BLOCK], slopes[2];
     float beyond = disti_far_from(field);
     const dist_net *net = shape->net;
@@ -7594,6 +7604,7 @@ static void disti_shape_slope(dist_shape *shape, const dist_field *field)
             if (!(sdf[j] > 0.0f) || !(disti_length(p[0], p[1], p[2]) <= field->radius)) continue;
             bins[far][bin]++;
             count[far]++;
+            if (disti_finite(slope)) most[far] = DISTI_MAX(most[far], slope);
         }
     }
     for (int far = 0; far < 2; far++) {
@@ -7603,6 +7614,8 @@ static void disti_shape_slope(dist_shape *shape, const dist_field *field)
     }
     shape->lipschitz = slopes[0];
     shape->lipschitz_far = slopes[1];
+    shape->certified = most[0];
+    shape->certified_far = most[1];
     if (shape->groups) shape->groups = disti_groups_pay(shape, points);
     disti_float_state_leave(state);
 }
@@ -7664,6 +7677,8 @@ DIST_API dist_field dist_shape_field(dist_shape *shape)
     field.radius = net->bound;
     field.lipschitz = shape->lipschitz;
     field.lipschitz_far = shape->lipschitz_far;
+    field.certified = shape->certified;
+    field.certified_far = shape->certified_far;
     field.clamp = net->clamp;
     field.cost = (float)dist_net_operations(net, 1);
     field.kinks = net->activation == DIST_ACTIVATION_RELU;
@@ -9076,7 +9091,7 @@ DIST_API dist_render_desc dist_render_desc_resolve(const dist_render_desc *desc)
     dist_render_desc how;
     memset(&how, 0, sizeof how);
     if (desc) how = *desc;
-    if (how.max_steps == 0) how.max_steps = how.trace == DIST_TRACE_PAPER ? 50 : how.certified ? 1000 : 100;
+    if (how.max_steps == 0) how.max_steps = how.trace == DIST_TRACE_PAPER ? 50 : how.certified ? 10000 : 100;
     if (how.step_scale == 0.0f) how.step_scale = 1.5f;
     if (how.epsilon == 0.0f && how.trace == DIST_TRACE_PAPER) how.epsilon = 5e-5f;
     if (how.samples == 0) how.samples = 1;
@@ -9150,8 +9165,14 @@ static dist_status disti_tracer_init(disti_tracer *tracer, dist_context *ctx, co
                                                      : 1.0f;
     tracer->far = disti_far_from(field);
     tracer->ratio = 1.0f;
-    if (!(tracer->how.lipschitz > 0.0f) && field->lipschitz_far > 0.0f)
-        tracer->ratio = tracer->lipschitz / field->lipschitz_far;
+    if (!(tracer->how.lipschitz > 0.0f)) {
+        float far = disti_lipschitz_far(field);
+        if (tracer->how.certified) {
+            tracer->lipschitz = DISTI_MAX(tracer->lipschitz, field->certified);
+            far = DISTI_MAX(far, field->certified_far);
+        }
+        tracer->ratio = tracer->lipschitz / far;
+    }
     tracer->noise = 5e-7f * field->radius;
     tracer->epsilon = tracer->how.epsilon;
     if (field->clamp > 0.0f && tracer->how.trace == DIST_TRACE_GUARDED)
@@ -10456,9 +10477,11 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
     if (tracer.how.trace != DIST_TRACE_GUARDED || tracer.how.warm_start)
         return disti_refuse(ctx, "dist_trace: how.%s is for pictures, must be 0",
                             tracer.how.warm_start ? "warm_start" : "trace DIST_TRACE_PAPER");
-    tracer.cache = field->cache;
+    int beyond = field->cache && tracer.how.certified && tracer.how.lipschitz == 0.0f &&
+                 (field->certified > field->cache->lipschitz || field->certified_far > field->cache->lipschitz_far);
+    tracer.cache = beyond ? NULL : field->cache;
     float most = field->cache ? DISTI_MIN(field->cache->lipschitz, field->cache->lipschitz_far) : 0.0f;
-    if (tracer.cache && tracer.how.lipschitz > most)
+    if (field->cache && tracer.how.lipschitz > most)
         return disti_fail(ctx, DIST_BAD_ARGUMENT,
                           "dist_trace: how.lipschitz is %d, must be at most the %d that field.cache was made with; "
                           "raise field.lipschitz before dist_cache_create", NULL, (double)tracer.how.lipschitz,

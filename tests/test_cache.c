@@ -295,6 +295,41 @@ TEST(a_cache_of_what_has_not_changed_is_taken)
     dist_context_destroy(ctx);
 }
 
+/* Certified rays use a cache only where it was made with figures as large as theirs. */
+TEST(certified_rays_use_no_cache_of_smaller_figures)
+{
+    dist_context *ctx = test_context();
+    const float ball[4] = {0, 0, 0, 0.5f}, o[3] = {0, 0, 3}, d[3] = {0.05f, 0, -1};
+    dist_field field = dist_field_sphere(ball), both;
+    field.radius = 2;
+    field.certified = 1.5f;
+    dist_instance one;
+    memset(&one, 0, sizeof one);
+    one.field = &field;
+    dist_scene *scene = dist_scene_create(ctx, 1, &one);
+    both = dist_scene_field(scene);
+    CHECK_NEAR(1.5f, both.certified, 0);
+    CHECK_NEAR(1.5f, both.certified_far, 0);
+    dist_render_desc how;
+    memset(&how, 0, sizeof how);
+    how.certified = 1;
+    dist_cache *cache = dist_cache_create(ctx, &field, 32);
+    dist_stats stats[3];
+    for (int k = 0; k < 3; k++) { /* none, too small, large enough */
+        dist_field raised = field;
+        raised.lipschitz = field.certified;
+        if (k == 2) CHECK_STATUS(DIST_OK, dist_cache_update(cache, &raised), ctx);
+        dist_field with = dist_cache_field(cache);
+        CHECK_STATUS(DIST_OK, dist_trace(ctx, k ? &with : &field, 1, o, d, &how, &plain[k], &stats[k]), ctx);
+        CHECK_NEAR(1.5f, stats[k].lipschitz, 0);
+    }
+    CHECK(stats[0].queries == stats[1].queries && stats[2].queries < stats[1].queries);
+    CHECK_BYTES(sizeof plain[0], &plain[0], &plain[1]);
+    dist_cache_destroy(cache);
+    dist_scene_destroy(scene);
+    dist_context_destroy(ctx);
+}
+
 static void wrapped_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
 {
     const dist_field *field = (const dist_field *)user;
@@ -473,6 +508,7 @@ int main(int argc, char **argv)
     RUN(pictures_are_the_same_with_and_without_a_cache);
     RUN(a_cache_of_what_has_changed_is_refused_until_it_is_made_anew);
     RUN(a_cache_of_what_has_not_changed_is_taken);
+    RUN(certified_rays_use_no_cache_of_smaller_figures);
     RUN(what_is_not_the_librarys_own_is_not_asked_whether_it_has_changed);
     RUN(bad_arguments_and_odd_fields_do_no_harm);
     RUN(a_cache_takes_memory_once_and_gives_all_of_it_back);

@@ -273,15 +273,15 @@ TEST(closest_points_of_networks_lie_on_their_surface)
         {.name = "softplus", .code_size = 2, .activation = DIST_ACTIVATION_SOFTPLUS, .first_scale = 4.0}};
     static float sdf[RAYS];
     dist_context *ctx = test_context();
-    for (int k = 0; k < 3; k++) {
+    for (int k = 0; k < 4; k++) { /* the mug: nearly 0 over a region within, without a crossing */
         test_random random = test_random_seed(43 + (unsigned)k);
         double code[MODEL_CODE] = {0.25, 0.25};
         float codef[2] = {0.25f, 0.25f};
         model m;
         dist_net *net;
         int n = RAYS;
-        if (k == 2) {
-            const char *path = test_data_path("nets/fox.safetensors");
+        if (k >= 2) {
+            const char *path = test_data_path(k == 2 ? "nets/fox.safetensors" : "nets/mug_camera_bottle.safetensors");
             FILE *file = fopen(path, "rb");
             if (!file) SKIP("there are no test data");
             fclose(file);
@@ -292,7 +292,7 @@ TEST(closest_points_of_networks_lie_on_their_surface)
             model_fit_ball(&m, code, 0.6);
             net = model_load(ctx, &m);
         }
-        dist_shape *shape = dist_shape_create(ctx, net, k == 2 ? dist_net_code(net, 0) : codef);
+        dist_shape *shape = dist_shape_create(ctx, net, k >= 2 ? dist_net_code(net, 0) : codef);
         dist_field field = dist_shape_field(shape);
         double residual = 0;
         int lost = 0;
@@ -304,7 +304,7 @@ TEST(closest_points_of_networks_lie_on_their_surface)
             if (status[i] == DIST_RAY_HIT) residual = fmax(residual, fabs((double)sdf[i]));
         }
         CHECK_NEAR(0, residual, 2e-5);
-        CHECK(lost <= n / 30); /* where f has a least value above 0 */
+        CHECK(lost <= n / 200); /* where f has a least value above 0 */
         if (test_state.verbose) printf("    %d of %d lost, residual %.2g\n", lost, n, residual);
         dist_shape_destroy(shape);
         dist_net_destroy(net);

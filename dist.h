@@ -10814,7 +10814,7 @@ static int disti_foot_advance(const dist_field *field, disti_foot *foot, float f
         }
         if (foot->steps % 12 == 0 && foot->steps >= DISTI_FOOT_STEPS / 2) { /* where |f| is least: off to elsewhere */
             const float aside[3] = {n[1], n[2], n[0]};
-            disti_foot_move(field, foot->x, aside, ldexpf(0.05f, foot->steps / 12 - 4) * field->radius);
+            disti_foot_move(field, foot->x, aside, 0.05f * field->radius * (float)(1 << (foot->steps / 12 - 4)));
             foot->damping = 1.0f;
             foot->f = 0.0f;
             return 1;

@@ -36,6 +36,11 @@ reports() {
               exit bad }' "$work/rows"
 }
 expect render_reports reports "$work/render" embedded --size 48
+certified_reports() {
+    reports "$work/render" embedded --size 48 --trace certified && grep -q '"trace": "certified"' "$work/report.json" &&
+        grep -q '^  holes  *0 ' "$work/rows"
+}
+expect certified_pictures_have_no_holes certified_reports
 expect fit_depth_reports reports "$work/fit_depth" --demo --size 32 --iterations 2
 # A fit says whether it has come to nothing: RATE RISEN.
 fit_says() {

@@ -222,7 +222,7 @@ typedef struct dist_field {
     float lipschitz;     /* bound or estimate of |grad f| where 0 < f < clamp / 2 (no clamp: radius / 20); 0: 1 */
     float lipschitz_far; /* the same where f is larger; 0: lipschitz */
     /* how.certified goes by these where they are larger than the two before, which may be those of most places: of a
-       net by the steepest place that dist_shape_create found */
+       net by the steepest places that dist_shape_create found. certified_far 0: certified */
     float certified, certified_far;
     float clamp;     /* |f| above this carries no distance (a clamped training); 0: none */
     float detail;    /* the radius that the defaults of how.epsilon and normal_delta go by; 0: radius */
@@ -604,8 +604,8 @@ DIST_API dist_cache *dist_cache_create(dist_context *ctx, const dist_field *fiel
 DIST_API void dist_cache_destroy(dist_cache *cache);
 /* The field with its cache, to be traced instead of it. Borrows both. As soon as the shape's code, the net's weights or
    the scene have changed every call refuses it; a field of your own without changes_fn must not change. A cache serves
-   Lipschitz figures up to those it was made with: raise field.lipschitz before, not how.lipschitz for dist_trace; and
-   to field.certified, for how.certified, which makes no use of the cache otherwise. */
+   Lipschitz figures up to those it was made with: raise field.lipschitz before, not how.lipschitz for dist_trace. With
+   how.certified it is used only where it was made with figures as large as field.certified and certified_far. */
 DIST_API dist_field dist_cache_field(const dist_cache *cache);
 /* Makes it anew for a field that has changed, or another one; then take dist_cache_field again. No allocator call. */
 DIST_API dist_status dist_cache_update(dist_cache *cache, const dist_field *field);
@@ -3809,6 +3809,11 @@ static int disti_stale(const dist_field *field)
 static float disti_lipschitz_far(const dist_field *field)
 {
     return field->lipschitz_far > 0.0f ? field->lipschitz_far : field->lipschitz > 0.0f ? field->lipschitz : 1.0f;
+}
+
+static float disti_certified_far(const dist_field *field)
+{
+    return field->certified_far > 0.0f ? field->certified_far : field->certified;
 }
 
 /* Whether what the cache shows to be empty is so for this field. */
@@ -9169,7 +9174,7 @@ static dist_status disti_tracer_init(disti_tracer *tracer, dist_context *ctx, co
         float far = disti_lipschitz_far(field);
         if (tracer->how.certified) {
             tracer->lipschitz = DISTI_MAX(tracer->lipschitz, field->certified);
-            far = DISTI_MAX(far, field->certified_far);
+            far = DISTI_MAX(far, disti_certified_far(field));
         }
         tracer->ratio = tracer->lipschitz / far;
     }
@@ -10477,9 +10482,10 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
     if (tracer.how.trace != DIST_TRACE_GUARDED || tracer.how.warm_start)
         return disti_refuse(ctx, "dist_trace: how.%s is for pictures, must be 0",
                             tracer.how.warm_start ? "warm_start" : "trace DIST_TRACE_PAPER");
-    int beyond = field->cache && tracer.how.certified && tracer.how.lipschitz == 0.0f &&
-                 (field->certified > field->cache->lipschitz || field->certified_far > field->cache->lipschitz_far);
-    tracer.cache = beyond ? NULL : field->cache;
+    tracer.cache = field->cache;
+    if (tracer.cache && tracer.how.certified && tracer.how.lipschitz == 0.0f &&
+        (field->certified > tracer.cache->lipschitz || disti_certified_far(field) > tracer.cache->lipschitz_far))
+        tracer.cache = NULL;
     float most = field->cache ? DISTI_MIN(field->cache->lipschitz, field->cache->lipschitz_far) : 0.0f;
     if (field->cache && tracer.how.lipschitz > most)
         return disti_fail(ctx, DIST_BAD_ARGUMENT,

@@ -620,8 +620,9 @@ typedef struct dist_contact {
     int status;      /* DIST_RAY_HIT: they touch; DIST_RAY_MISS; else as dist_field_closest_point */
 } dist_contact;
 
-/* n spheres (n, 4), center and radius (below 0: refused), against the field. A sphere that is clear of it costs one
-   query, or none where it is clear of the bounding sphere. */
+/* n spheres (n, 4), center and radius (below 0: refused), against the field. A sphere that is clear of it, by the
+   figures for how.certified or those that its cache was made with, costs one query, or none where it is clear of the
+   bounding sphere. */
 DIST_API dist_status dist_field_collide(dist_context *ctx, const dist_field *field, size_t n, const float *spheres,
                                         dist_contact *contacts);
 
@@ -4318,6 +4319,14 @@ static float disti_steepest(const dist_field *field)
 {
     float near = field->lipschitz > 0.0f ? field->lipschitz : 1.0f;
     return DISTI_MAX(near, field->lipschitz_far);
+}
+
+/* No surface is nearer than this to where |f| = f, by the figures for how.certified. */
+static float disti_certified_empty(const dist_field *field, float f)
+{
+    float near = DISTI_MAX(field->lipschitz > 0.0f ? field->lipschitz : 1.0f, field->certified);
+    float far = DISTI_MAX(disti_lipschitz_far(field), disti_certified_far(field)), from = disti_far_from(field);
+    return f > from ? from / near + (f - from) / far : f / near;
 }
 
 /* Scenes. An instance's field lives in its bounding sphere (center c, radius r), q is p in the shape's space,
@@ -10784,15 +10793,15 @@ static int disti_foot_advance(const dist_field *field, disti_foot *foot, float f
         for (int i = 0; i < 3; i++) n[i] = length > 1e-6f * field->radius ? n[i] / length : i == 0 ? 1.0f : 0.0f;
     }
     if (foot->steps++ == 0) {
-        float least = f > 0.0f || foot->away <= 0.0f ? size / lipschitz : 0.0f;
-        const float way[3] = {foot->away, least, 0.0f};
-        least = disti_foot_length(way);
+        float asked = f > 0.0f || foot->away <= 0.0f ? size : 0.0f;
+        const float least[3] = {foot->away, asked / lipschitz, 0.0f};
+        const float clear[3] = {foot->away, disti_certified_empty(field, asked), 0.0f};
         foot->sign = f < 0.0f && foot->away <= 0.0f ? -1.0f : 1.0f;
-        foot->least = least;
+        foot->least = disti_foot_length(least);
         foot->told = size + foot->away;
-        if (foot->sign > 0.0f && foot->radius < 3e38f && least >= foot->radius) {
+        if (foot->sign > 0.0f && foot->radius < 3e38f && disti_foot_length(clear) >= foot->radius) {
             foot->status = DIST_RAY_MISS;
-            foot->distance = least;
+            foot->distance = disti_foot_length(clear);
             return 0;
         }
     }

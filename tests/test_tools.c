@@ -492,6 +492,61 @@ TEST(spheres_that_are_clear_cost_one_query_or_none)
     dist_context_destroy(ctx);
 }
 
+/* Spheres that are told to be clear of what a nearest point lies in them; touching: how many one lies in. */
+static int touching_missed(dist_context *ctx, const dist_field *field, int *touching)
+{
+    static float spheres[4 * RAYS];
+    test_random random = test_random_seed(71);
+    int missed = *touching = 0;
+    make_points(&random, 3, 0.8f);
+    for (int i = 0; i < RAYS; i++) {
+        memcpy(spheres + 4 * i, points + 3 * i, 3 * sizeof(float));
+        spheres[4 * i + 3] = test_random_float(&random, 0.01f, 0.1f);
+    }
+    CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, field, RAYS, points, closest, distance, status), ctx);
+    CHECK_STATUS(DIST_OK, dist_field_collide(ctx, field, RAYS, spheres, contacts), ctx);
+    for (int i = 0; i < RAYS; i++) {
+        int touches = status[i] == DIST_RAY_HIT && distance[i] < 0.999f * spheres[4 * i + 3];
+        *touching += touches;
+        missed += touches && contacts[i].status != DIST_RAY_HIT;
+    }
+    return missed;
+}
+
+/* By the slope of most places a steep place's sphere of |f| / slope reaches into the surface. */
+TEST(no_sphere_that_touches_a_steep_field_is_told_to_be_clear)
+{
+    static const char *const nets[] = {"rings", "round_cross", "bunny_relu"};
+    dist_context *ctx = shape_context();
+    test_shape shape = shape_make(SHAPE_TORUS, 0.6, 0.2, 0, 0);
+    shape.slope = 2;
+    dist_field steep = shape_field(&shape, 1, 1);
+    int touching;
+    CHECK(touching_missed(ctx, &steep, &touching) > 0);
+    steep.certified = 2;
+    CHECK_EQUAL(0, touching_missed(ctx, &steep, &touching));
+    CHECK(touching > 100);
+    for (int k = 0; k < 3; k++) {
+        char path[64];
+        (void)snprintf(path, sizeof path, "nets/%s.safetensors", nets[k]);
+        FILE *file = fopen(test_data_path(path), "rb");
+        if (!file) dist_context_destroy(ctx);
+        if (!file) SKIP("there are no test data");
+        fclose(file);
+        dist_net *net = dist_net_load_file(ctx, test_data_path(path));
+        dist_shape *shape_of = dist_shape_create(ctx, net, net ? dist_net_code(net, k == 1 ? 10 : 0) : NULL);
+        dist_field field = dist_shape_field(shape_of), most = field;
+        CHECK_EQUAL(0, touching_missed(ctx, &field, &touching));
+        most.certified = most.certified_far = 0;
+        int missed = touching_missed(ctx, &most, &touching);
+        CHECK(touching > 100 && (missed > 0 || k > 0));
+        if (test_state.verbose) printf("    %s: %d touch, by most slopes %d of them missed\n", nets[k], touching, missed);
+        dist_shape_destroy(shape_of);
+        dist_net_destroy(net);
+    }
+    dist_context_destroy(ctx);
+}
+
 TEST(spheres_touch_the_instance_that_is_there)
 {
     dist_context *ctx = test_context();
@@ -701,6 +756,7 @@ int main(int argc, char **argv)
     RUN(closest_points_of_thin_boards_are_found);
     RUN(contacts_have_the_depth_and_the_normal_of_the_shape);
     RUN(spheres_that_are_clear_cost_one_query_or_none);
+    RUN(no_sphere_that_touches_a_steep_field_is_told_to_be_clear);
     RUN(spheres_touch_the_instance_that_is_there);
     RUN(what_has_no_answer_says_so);
     RUN(more_points_than_there_can_be_are_refused);

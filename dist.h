@@ -4321,14 +4321,6 @@ static float disti_steepest(const dist_field *field)
     return DISTI_MAX(near, field->lipschitz_far);
 }
 
-/* No surface is nearer than this to where |f| = f, by the figures for how.certified. */
-static float disti_certified_empty(const dist_field *field, float f)
-{
-    float near = DISTI_MAX(field->lipschitz > 0.0f ? field->lipschitz : 1.0f, field->certified);
-    float far = DISTI_MAX(disti_lipschitz_far(field), disti_certified_far(field)), from = disti_far_from(field);
-    return f > from ? from / near + (f - from) / far : f / near;
-}
-
 /* Scenes. An instance's field lives in its bounding sphere (center c, radius r), q is p in the shape's space,
    d = |q - c| - r, m = r / 5. What is asked of it stays within the sphere; outside it goes on as a lower bound of the
    distance:
@@ -10776,6 +10768,14 @@ static int disti_foot_pull(const dist_field *field, disti_foot *foot, float gain
     foot->damping = 1.0f;
     foot->f = 0.0f;
     return 1;
+}
+
+/* No surface is nearer than this to where |f| = f, by the figures for how.certified. */
+static float disti_certified_empty(const dist_field *field, float f)
+{
+    float near = DISTI_MAX(field->lipschitz > 0.0f ? field->lipschitz : 1.0f, field->certified);
+    float far = DISTI_MAX(disti_lipschitz_far(field), disti_certified_far(field)), from = disti_far_from(field);
+    return f > from ? from / near + (f - from) / far : f / near;
 }
 
 /* One sample f with gradient g at x. 1: another one is wanted at the new x. */

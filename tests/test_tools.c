@@ -540,7 +540,7 @@ TEST(no_sphere_that_touches_a_steep_field_is_told_to_be_clear)
         most.certified = most.certified_far = 0;
         int missed = touching_missed(ctx, &most, &touching);
         CHECK(touching > 100 && (missed > 0 || k > 0));
-        if (test_state.verbose) printf("    %s: %d touch, by most slopes %d of them missed\n", nets[k], touching, missed);
+        if (test_state.verbose) printf("    %s: %d touch, by most slopes %d missed\n", nets[k], touching, missed);
         dist_shape_destroy(shape_of);
         dist_net_destroy(net);
     }

@@ -584,7 +584,8 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
                                 dist_stats *stats);
 
 /* The nearest point of the surface to each of n points, found from where |f| falls: steps along the gradient onto the
-   surface, then along the surface as long as that brings it nearer. Exact for a distance; else a local nearest point.
+   surface, then along the surface as long as that brings it nearer, then a look around for nearer parts. Exact for a
+   distance; else mostly the nearest, at the least a local nearest point.
    closest (n, 3); distance (n) signed, below 0 inside, and status (n) may be NULL: DIST_RAY_HIT, DIST_RAY_UNRESOLVED
    (no surface found: the last point tried), DIST_RAY_NOT_FINITE. Nothing is asked outside the bounding sphere. */
 DIST_API dist_status dist_field_closest_point(dist_context *ctx, const dist_field *field, size_t n,
@@ -10677,7 +10678,8 @@ DIST_API unsigned long long dist_cache_queries(const dist_cache *cache) { return
    to p. That takes a few queries where the surface is smooth, and may come to no end in a crease. Then, from the
    nearest x found, a share of the way back to p and down again, x' = P(x + share (p - x)), which stays where x is
    nearest, in creases too, cannot overshoot where the surface bends away, and may find another part of the surface,
-   before this one; a quarter of the share where that came no nearer. */
+   before this one; a quarter of the share where that came no nearer. Where f at p does not bear out what was found,
+   samples around p tell of nearer parts that no gradient leads to, up to three times. */
 typedef struct disti_foot {
     float p[3], x[3];
     float best[3], normal[3]; /* nearest surface point so far, grad f there at unit length; before there is one: the
@@ -10690,10 +10692,12 @@ typedef struct disti_foot {
     float f, damping, share;
     float rest[3], relax; /* the last slide's, and by which share of it */
     float sign;
+    float hope[3], hoped, before; /* of a look around: the nearest place foretold, how far; the distance at its start */
     unsigned char status, steps, slides, sides; /* sides: 1 a sample was outside, 2 inside */
+    unsigned char look, looks; /* samples of this look around, 0: none; looks so far */
 } disti_foot;
 
-enum { DISTI_FEET = 512, DISTI_FOOT_STEPS = 96, DISTI_FOOT_SLIDES = 16 }; /* slides among the first steps */
+enum { DISTI_FEET = 512, DISTI_FOOT_STEPS = 160, DISTI_FOOT_TURN = 48, DISTI_FOOT_SLIDES = 16 }; /* slides first */
 
 /* Of a way to a point as far off as a float can say, whose square it cannot. */
 static float disti_foot_length(const float d[3])
@@ -10770,6 +10774,56 @@ static int disti_foot_pull(const dist_field *field, disti_foot *foot, float gain
     return 1;
 }
 
+/* The next of 12 samples around p, at the corners of an icosahedron half way between where the surface can be at the
+   nearest and the nearest point so far; after the last one off to the nearest place that one of them foretold. 0: there
+   is none nearer, or the last look found none. */
+static int disti_foot_look(const dist_field *field, disti_foot *foot)
+{
+    float within = DISTI_MIN(foot->distance, foot->radius);
+    if (foot->look == 0) {
+        int vain = foot->looks > 0 && foot->distance > foot->before - 1e-3f * field->radius;
+        if (vain || foot->looks == 3 || foot->steps + 24 > DISTI_FOOT_STEPS)
+            return disti_foot_pull(field, foot, field->radius);
+        foot->looks++;
+        foot->before = foot->distance;
+        foot->hoped = 3e38f;
+    } else if (foot->look == 12) {
+        foot->look = 0;
+        if (!(foot->hoped < 0.98f * within)) return disti_foot_pull(field, foot, field->radius);
+        memcpy(foot->x, foot->hope, sizeof foot->x);
+        foot->damping = 1.0f;
+        foot->share = 0.5f;
+        foot->f = 0.0f;
+        return 1;
+    }
+    int k = foot->look++, axis = k / 4;
+    float corner[3];
+    corner[axis] = 0.0f;
+    corner[(axis + 1) % 3] = k & 1 ? 0.52573111f : -0.52573111f;
+    corner[(axis + 2) % 3] = k & 2 ? 0.85065081f : -0.85065081f;
+    memcpy(foot->x, foot->p, sizeof foot->x);
+    disti_foot_move(field, foot->x, corner, 0.5f * (foot->least + within));
+    return 1;
+}
+
+/* What the sample f with gradient n * slope at x foretells: where f ends if it is linear, between p and x if it has
+   another sign than at p. */
+static void disti_foot_looked(disti_foot *foot, float f, const float *n, float slope)
+{
+    float at[3], d[3];
+    int crosses = f * foot->sign < 0.0f;
+    float told = foot->told - foot->away, size = f < 0.0f ? -f : f;
+    for (int i = 0; i < 3; i++) {
+        if (crosses) at[i] = foot->p[i] + (foot->x[i] - foot->p[i]) * (told / (told + size));
+        else at[i] = foot->x[i] - f / slope * n[i];
+        d[i] = foot->p[i] - at[i];
+    }
+    float away = disti_foot_length(d);
+    if (!(away < foot->hoped)) return;
+    memcpy(foot->hope, at, sizeof at);
+    foot->hoped = away;
+}
+
 /* No surface is nearer than this to where |f| = f, by the figures for how.certified. */
 static float disti_certified_empty(const dist_field *field, float f)
 {
@@ -10784,6 +10838,7 @@ static int disti_foot_advance(const dist_field *field, disti_foot *foot, float f
     float lipschitz = field->lipschitz > 0.0f ? field->lipschitz : 1.0f, size = f < 0.0f ? -f : f;
     float slope = disti_length(g[0], g[1], g[2]), n[3];
     if (!disti_finite(f) || !disti_finite(slope)) {
+        if (foot->look > 0) return disti_foot_look(field, foot);
         foot->status = DIST_RAY_NOT_FINITE;
         return 0;
     }
@@ -10792,16 +10847,20 @@ static int disti_foot_advance(const dist_field *field, disti_foot *foot, float f
         float length = disti_length(n[0], n[1], n[2]);
         for (int i = 0; i < 3; i++) n[i] = length > 1e-6f * field->radius ? n[i] / length : i == 0 ? 1.0f : 0.0f;
     }
+    if (foot->look > 0) {
+        foot->steps++;
+        if (slope > 1e-6f) disti_foot_looked(foot, f, n, slope);
+        return disti_foot_look(field, foot);
+    }
     if (foot->steps++ == 0) {
         float asked = f > 0.0f || foot->away <= 0.0f ? size : 0.0f;
-        const float least[3] = {foot->away, asked / lipschitz, 0.0f};
         const float clear[3] = {foot->away, disti_certified_empty(field, asked), 0.0f};
         foot->sign = f < 0.0f && foot->away <= 0.0f ? -1.0f : 1.0f;
-        foot->least = disti_foot_length(least);
+        foot->least = disti_foot_length(clear);
         foot->told = size + foot->away;
-        if (foot->sign > 0.0f && foot->radius < 3e38f && disti_foot_length(clear) >= foot->radius) {
+        if (foot->sign > 0.0f && foot->radius < 3e38f && foot->least >= foot->radius) {
             foot->status = DIST_RAY_MISS;
-            foot->distance = disti_foot_length(clear);
+            foot->distance = foot->least;
             return 0;
         }
     }
@@ -10812,13 +10871,17 @@ static int disti_foot_advance(const dist_field *field, disti_foot *foot, float f
     if (foot->steps < DISTI_FOOT_SLIDES && foot->status == DIST_RAY_HIT && slope > (on ? 0.1f : 0.5f) * lipschitz &&
         (on || size < 0.02f * field->radius)) {
         if (disti_foot_slide(field, foot, n, f / slope, on)) return 1;
-        if (foot->distance * slope <= 1.2f * foot->told) return 0; /* about as far as f said at p */
+        float along = foot->distance * slope; /* about as far as f said at p, and f nearly a distance */
+        if (along <= 1.2f * foot->told && along >= 0.8f * foot->told && slope > 0.5f * lipschitz) return 0;
     }
-    if (on) return disti_foot_pull(field, foot, gain);
+    if (on) {
+        int tires = foot->looks == 0 && foot->steps >= DISTI_FOOT_TURN; /* in a crease pulls come to no end */
+        return (!tires && disti_foot_pull(field, foot, gain)) || disti_foot_look(field, foot);
+    }
     if (foot->status != DIST_RAY_HIT) {
         memcpy(f > 0.0f ? foot->best : foot->normal, foot->x, sizeof foot->x);
         foot->sides |= (unsigned char)(f > 0.0f ? 1 : 2);
-        if (foot->sides >= 2 && foot->steps >= DISTI_FOOT_STEPS / 2) { /* to and fro in a thin solid: bisect */
+        if (foot->sides >= 2 && foot->steps >= DISTI_FOOT_TURN) { /* to and fro in a thin solid: bisect */
             if (foot->sides == 2) {
                 memcpy(foot->best, foot->x, sizeof foot->x);
                 disti_foot_move(field, foot->best, n, 2.0f * field->radius);
@@ -10827,9 +10890,10 @@ static int disti_foot_advance(const dist_field *field, disti_foot *foot, float f
             for (int i = 0; i < 3; i++) foot->x[i] = 0.5f * (foot->best[i] + foot->normal[i]);
             return 1;
         }
-        if (foot->steps % 12 == 0 && foot->steps >= DISTI_FOOT_STEPS / 2) { /* where |f| is least: off to elsewhere */
+        if (foot->steps % 12 == 0 && foot->steps >= DISTI_FOOT_TURN) { /* where |f| is least: off to elsewhere */
             const float aside[3] = {n[1], n[2], n[0]};
-            disti_foot_move(field, foot->x, aside, 0.05f * field->radius * (float)(1 << (foot->steps / 12 - 4)));
+            int times = 1 << (foot->steps - DISTI_FOOT_TURN) / 12 % 4;
+            disti_foot_move(field, foot->x, aside, 0.05f * (float)times * field->radius);
             foot->damping = 1.0f;
             foot->f = 0.0f;
             return 1;

@@ -10779,7 +10779,7 @@ static int disti_foot_pull(const dist_field *field, disti_foot *foot, float gain
    is none nearer, or the last look found none. */
 static int disti_foot_look(const dist_field *field, disti_foot *foot)
 {
-    float within = DISTI_MIN(foot->distance, foot->radius);
+    float within = foot->sign > 0.0f ? DISTI_MIN(foot->distance, foot->radius) : foot->distance;
     if (foot->look == 0) {
         int vain = foot->looks > 0 && foot->distance > foot->before - 1e-3f * field->radius;
         if (vain || foot->looks == 3 || foot->steps + 24 > DISTI_FOOT_STEPS)

@@ -550,6 +550,7 @@ static int touching_missed(dist_context *ctx, const dist_field *field, int *touc
         int touches = status[i] == DIST_RAY_HIT && distance[i] < 0.999f * spheres[4 * i + 3];
         *touching += touches;
         missed += touches && contacts[i].status != DIST_RAY_HIT;
+        if (distance[i] < 0) CHECK_NEAR(spheres[4 * i + 3] - distance[i], contacts[i].depth, 2e-6);
     }
     return missed;
 }

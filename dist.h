@@ -9660,7 +9660,8 @@ static int disti_ray_band(const disti_tracer *tracer, disti_ray *ray, float f)
     if (tracer->how.certified) { /* on until the steps are spent */
         float rise = f - fabsf(ray->fbest); /* beyond the rounding of numbers of the radius's size: no plateau */
         int flat = change < 1e-3f * all && rise <= 1.2e-7f * tracer->field->radius;
-        int last = ray->steps + 1 >= tracer->how.max_steps && flat;
+        int zeros = ray->steps >= 1000 && f == 0.0f && change == 0.0f; /* a network of zeros */
+        int last = (ray->steps + 1 >= tracer->how.max_steps && flat) || zeros;
         return last ? disti_ray_end(ray, DIST_RAY_PLATEAU, ray->s, f, 0.0f) : disti_ray_feel(tracer, ray, epsilon);
     }
     if (ray->side >= 16 && !(change >= 1e-3f * all)) return disti_ray_end(ray, DIST_RAY_PLATEAU, ray->s, f, 0.0f);

@@ -703,6 +703,21 @@ TEST(lipschitz_far_holds_where_f_is_large)
     dist_context_destroy(ctx);
 }
 
+/* A network of zeros: the steps of certified rays are not all spent on it. */
+TEST(what_is_0_everywhere_ends_certified_rays_after_a_thousand_steps)
+{
+    dist_context *ctx = shape_context();
+    test_shape shape = shape_make(SHAPE_CONSTANT, 0, 0, 0, 0);
+    dist_field field = shape_field(&shape, 1, 1);
+    dist_camera camera = shape_camera(16, 16);
+    dist_render_desc how = plain_how();
+    how.certified = 1;
+    CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, &how, &picture_a), ctx);
+    CHECK(picture_a.stats.plateau > 0 && picture_a.stats.hits == 0);
+    CHECK(picture_a.stats.queries < 1010 * picture_a.stats.rays_in_sphere);
+    dist_context_destroy(ctx);
+}
+
 TEST(cones_change_no_pixel)
 {
     dist_context *ctx = shape_context();
@@ -2138,6 +2153,7 @@ int main(int argc, char **argv)
     RUN(no_wire_before_a_surface_is_passed_by_certified_pictures);
     RUN(one_hit_in_a_thousand_is_lost_of_random_thin_parts_and_none_certified);
     RUN(lipschitz_far_holds_where_f_is_large);
+    RUN(what_is_0_everywhere_ends_certified_rays_after_a_thousand_steps);
     RUN(cones_change_no_pixel);
     RUN(grazing_rays_hit_within_the_bound_or_say_that_they_are_unresolved);
     RUN(twelve_queries_finish_98_of_100_rays_once_they_have_crossed);

@@ -3813,9 +3813,15 @@ static float disti_lipschitz_far(const dist_field *field)
     return field->lipschitz_far > 0.0f ? field->lipschitz_far : field->lipschitz > 0.0f ? field->lipschitz : 1.0f;
 }
 
+/* The two figures for how.certified. */
+static float disti_certified(const dist_field *field)
+{
+    return DISTI_MAX(field->lipschitz > 0.0f ? field->lipschitz : 1.0f, field->certified);
+}
+
 static float disti_certified_far(const dist_field *field)
 {
-    return field->certified_far > 0.0f ? field->certified_far : field->certified;
+    return DISTI_MAX(disti_lipschitz_far(field), field->certified_far > 0.0f ? field->certified_far : field->certified);
 }
 
 /* Whether what the cache shows to be empty is so for this field. */
@@ -9175,8 +9181,8 @@ static dist_status disti_tracer_init(disti_tracer *tracer, dist_context *ctx, co
     if (!(tracer->how.lipschitz > 0.0f)) {
         float far = disti_lipschitz_far(field);
         if (tracer->how.certified) {
-            tracer->lipschitz = DISTI_MAX(tracer->lipschitz, field->certified);
-            far = DISTI_MAX(far, disti_certified_far(field));
+            tracer->lipschitz = disti_certified(field);
+            far = disti_certified_far(field);
         }
         tracer->ratio = tracer->lipschitz / far;
     }
@@ -10487,7 +10493,7 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
                             tracer.how.warm_start ? "warm_start" : "trace DIST_TRACE_PAPER");
     tracer.cache = field->cache;
     if (tracer.cache && tracer.how.certified && tracer.how.lipschitz == 0.0f &&
-        (field->certified > tracer.cache->lipschitz || disti_certified_far(field) > tracer.cache->lipschitz_far))
+        (tracer.lipschitz > tracer.cache->lipschitz || disti_certified_far(field) > tracer.cache->lipschitz_far))
         tracer.cache = NULL;
     float most = field->cache ? DISTI_MIN(field->cache->lipschitz, field->cache->lipschitz_far) : 0.0f;
     if (field->cache && tracer.how.lipschitz > most)
@@ -10828,9 +10834,8 @@ static void disti_foot_looked(disti_foot *foot, float f, const float *n, float s
 /* No surface is nearer than this to where |f| = f, by the figures for how.certified. */
 static float disti_certified_empty(const dist_field *field, float f)
 {
-    float near = DISTI_MAX(field->lipschitz > 0.0f ? field->lipschitz : 1.0f, field->certified);
-    float far = DISTI_MAX(disti_lipschitz_far(field), disti_certified_far(field)), from = disti_far_from(field);
-    return f > from ? from / near + (f - from) / far : f / near;
+    float near = disti_certified(field), from = disti_far_from(field);
+    return f > from ? from / near + (f - from) / disti_certified_far(field) : f / near;
 }
 
 /* One sample f with gradient g at x. 1: another one is wanted at the new x. */

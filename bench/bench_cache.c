@@ -210,7 +210,8 @@ int main(int argc, char **argv)
             }
             printf("%s,%d,%lu,%lu,%llu,%.4f,%.0f,%.4f,%.3f,%.3f,%lu\n", names[kind], resolutions[r],
                    (unsigned long)b->n, (unsigned long)b->hits, dist_cache_queries(proven ? sure_cache : cache),
-                   !cache ? 0.0 : proven ? sure_made : made, queries, taken, queries / b->queries, taken / b->seconds, (unsigned long)differ);
+                   !cache ? 0.0 : proven ? sure_made : made, queries, taken, queries / b->queries, taken / b->seconds,
+                   (unsigned long)differ);
             fflush(stdout);
         }
         dist_cache_destroy(cache);

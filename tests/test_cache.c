@@ -309,7 +309,7 @@ TEST(certified_rays_use_no_cache_of_smaller_figures)
     dist_scene *scene = dist_scene_create(ctx, 1, &one);
     both = dist_scene_field(scene);
     CHECK_NEAR(1.5f, both.certified, 0);
-    CHECK_NEAR(1.5f, both.certified_far, 0); /* 0 is as near */
+    CHECK_NEAR(1.5f, both.certified_far, 0); /* the field's is 0: certified */
     dist_render_desc how;
     memset(&how, 0, sizeof how);
     how.certified = 1;

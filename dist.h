@@ -4067,8 +4067,11 @@ static void disti_backward_seed(void *user, size_t first, size_t count, const fl
     else memcpy(d_sdf, job->d_sdf + at, count * sizeof(float));
     if (job->seed_fn && job->d_sdf) memcpy(job->d_sdf + at, d_sdf, count * sizeof(float));
     if (!job->d_points || !gradient) return;
-    for (size_t i = 0; i < count; i++)
-        for (size_t j = 0; j < 3; j++) job->d_points[3 * (at + i) + j] += d_sdf[i] * gradient[3 * i + j];
+    for (float *d = job->d_points + 3 * at; count > 0; count--, d += 3, gradient += 3, d_sdf++) {
+        d[0] += *d_sdf * gradient[0];
+        d[1] += *d_sdf * gradient[1];
+        d[2] += *d_sdf * gradient[2];
+    }
 }
 
 static void disti_backward_task(void *arg, int index, int worker)
@@ -6297,31 +6300,30 @@ static void disti_net_output(const dist_shape *shape, const disti_block *b, cons
     float v[DISTI_BLOCK], d[DISTI_BLOCK], t[DISTI_BLOCK], bend[DISTI_BLOCK];
     float level = channel == net->sdf_channel ? net->level : 0.0f;
     int twice = net->output == DISTI_OUTPUT_TANH_TWICE;
+    size_t count = b->half ? (size_t)b->half : (size_t)DISTI_BLOCK;
     memcpy(v, value, sizeof v);
     for (size_t c = 0; c < DISTI_BLOCK && b->half; c++) v[c] += bias;
-    for (size_t c = 0; c < DISTI_BLOCK && !b->values; c++) {
-        d[c] = 1.0f;
-        bend[c] = 0.0f;
-    }
+    for (size_t c = 0; c < DISTI_BLOCK; c++) d[c] = 1.0f;
+    memset(bend, 0, sizeof bend);
     for (int k = 0; k < twice + (twice || net->output == DISTI_OUTPUT_TANH); k++) {
         b->kernels.activate(DIST_ACTIVATION_TANH, 1.0f, DISTI_BLOCK, v, b->values ? NULL : t);
-        for (size_t c = 0; c < DISTI_BLOCK && !b->values; c++) {
+        for (size_t c = 0; c < count && b->half; c++)
             bend[c] = t[c] * (bend[c] - 2.0f * v[c] * d[c] * d[c]); /* of t(v): t'' v'^2 + t' v'' */
-            d[c] *= t[c];
-        }
-    }
-    for (size_t c = 0; c < (b->half ? (size_t)b->half : (size_t)DISTI_BLOCK); c++) {
-        int finite = disti_finite(value[c]); /* else value stays what it is: the ray is told */
-        if (net->output == DISTI_OUTPUT_SIGMOID) {
-            d[c] = disti_sigmoid_slope(v[c]);
-            v[c] = disti_sigmoid(v[c]);
-            bend[c] = d[c] * (1.0f - 2.0f * v[c]);
-        }
-        if (finite) value[c] = v[c] - level;
         if (b->values) continue;
-        b->value_slope[c] = finite ? d[c] : 0.0f;
-        b->value_curvature[c] = finite ? bend[c] : 0.0f;
+        for (size_t c = 0; c < DISTI_BLOCK; c++) d[c] *= t[c];
     }
+    for (size_t c = 0; c < count && net->output == DISTI_OUTPUT_SIGMOID; c++) {
+        d[c] = disti_sigmoid_slope(v[c]);
+        v[c] = disti_sigmoid(v[c]);
+        bend[c] = d[c] * (1.0f - 2.0f * v[c]);
+    }
+    for (size_t c = 0; c < count; c++) {
+        if (disti_finite(value[c])) value[c] = v[c] - level;
+        else d[c] = bend[c] = 0.0f; /* and value stays what it is: the ray is told */
+    }
+    if (b->values) return;
+    memcpy(b->value_slope, d, sizeof d);
+    memcpy(b->value_curvature, bend, sizeof bend);
 }
 
 /* delta of layer l's output (after the activation) to that of its pre-activation, in place. ReLU's mask is in it
@@ -6406,10 +6408,12 @@ static void disti_linear_backward(const dist_shape *shape, const disti_kernels *
     kernels->gemm_back(&g);
 }
 
-static void disti_add_point_rows(const disti_linear *layer, const float *d_x, float *d_point)
+static void disti_add_point_rows(const disti_linear *layer, const float *DISTI_RESTRICT d_x,
+                                 float *DISTI_RESTRICT d_point)
 {
     const float *from = d_x + (size_t)layer->prev * DISTI_BLOCK;
-    for (size_t i = 0; i < (size_t)layer->point * DISTI_BLOCK; i++) d_point[i] += from[i];
+    for (int row = 0; row < layer->point; row++, from += DISTI_BLOCK, d_point += DISTI_BLOCK)
+        for (size_t c = 0; c < DISTI_BLOCK; c++) d_point[c] += from[c]; /* of a known length: in vectors */
 }
 
 /* Keeps layer l's delta for the weights, its dead rows as zeros. */

@@ -253,6 +253,11 @@ TEST(a_cache_of_what_has_changed_is_refused_until_it_is_made_anew)
     with.lipschitz *= 2;
     CHECK_STATUS(DIST_BAD_ARGUMENT, trace_one(ctx, &with, 0), ctx);
     CHECK_TEXT("dist_trace: field.lipschitz is", dist_context_message(ctx));
+    dist_field steeper = dist_cache_field(cache);
+    steeper.lipschitz_far = 2.0f * disti_lipschitz_far(&steeper);
+    dist_context_clear(ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, trace_one(ctx, &steeper, 0), ctx);
+    CHECK_TEXT("dist_trace: field.lipschitz_far is", dist_context_message(ctx));
     dist_context_clear(ctx);
     CHECK_STATUS(DIST_OK, dist_cache_update(cache, &with), ctx);
     with = dist_cache_field(cache);

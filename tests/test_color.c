@@ -747,6 +747,22 @@ TEST(a_texture_that_does_not_fit_and_gradients_that_are_not_there_are_refused)
     dist_field plain = dist_field_sphere(sphere);
     CHECK_STATUS(DIST_UNSUPPORTED, dist_color_eval(s.ctx, &plain, 1, x, x), s.ctx);
     CHECK_STATUS(DIST_UNSUPPORTED, dist_color_backward(s.ctx, &plain, 1, x, x, NULL, &grads), s.ctx);
+    dist_field own = s.field; /* codes that are not there, or cannot be */
+    memset(&grads, 0, sizeof grads);
+    grads.code = g;
+    own.code_size = 0;
+    dist_context_clear(s.ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_color_backward(s.ctx, &own, 1, x, x, NULL, &grads), s.ctx);
+    CHECK_TEXT("grads.code is given, but the field has no code", dist_context_message(s.ctx));
+    own.code_size = -1;
+    dist_context_clear(s.ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_color_eval(s.ctx, &own, 1, x, x), s.ctx);
+    CHECK_TEXT("field.code_size is -1", dist_context_message(s.ctx));
+    grads.code = NULL;
+    grads.color_weights = g;
+    dist_context_clear(s.ctx);
+    CHECK_STATUS(DIST_UNSUPPORTED, dist_field_backward(s.ctx, &plain, 1, x, x, NULL, NULL, NULL, &grads), s.ctx);
+    CHECK_TEXT("grads.color_weights is given, but the field has no texture", dist_context_message(s.ctx));
     grads = gradients_of(&s, g);
     s.field.color_adjoint_fn = NULL;
     dist_tape *tape = pictures_take(&a, &s);

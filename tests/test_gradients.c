@@ -1494,6 +1494,38 @@ TEST(an_upstream_gradient_that_is_not_finite_counts_as_zero)
     }
 }
 
+/* Over |n . v| = .7 a finite weight may become infinite. */
+TEST(an_upstream_gradient_that_overflows_is_left_out_and_counted)
+{
+    scene s;
+    dist_render_desc how = implicit_how();
+    static pictures a;
+    float w[PIXELS];
+    dist_images d_out;
+    dist_stats stats[2];
+    scene_analytic(&s, SPHERE);
+    dist_tape *tape = pictures_take(&a, &s, &how);
+    for (int k = 0; k < 2; k++) {
+        result got;
+        int most = 0;
+        result_begin(&got, &s);
+        for (int i = 1; i < PIXELS; i++) most = a.mask[i] && (!a.mask[most] || a.depth[i] > a.depth[most]) ? i : most;
+        for (int i = 0; i < PIXELS; i++) w[i] = i == most ? (k ? 3e38f : 1.0f) : 0.0f; /* the most inclined hit */
+        memset(&d_out, 0, sizeof d_out);
+        memset(&stats[k], 0, sizeof stats[k]);
+        d_out.depth = d_out.distance = w;
+        d_out.stats = &stats[k];
+        CHECK_STATUS(DIST_OK, dist_render_backward(s.ctx, tape, &d_out, &got.grads), s.ctx);
+        for (int group = 0; group < GROUPS; group++)
+            for (int i = 0; i < slots(&s, group); i++) CHECK(test_finite((double)result_group(&got, group)[i]));
+        CHECK((got.grads.code[3] != 0.0f) == !k); /* by the radius */
+        free(got.weights);
+    }
+    CHECK_EQUAL(1, stats[1].capped);
+    dist_tape_destroy(tape);
+    scene_close(&s);
+}
+
 TEST(gradients_are_added_to_what_is_there)
 {
     for (int k = 0; k < 3; k++) {
@@ -2034,6 +2066,7 @@ int main(int argc, char **argv)
     RUN(a_lens_is_recovered_from_a_tenth_off);
     RUN(a_zero_upstream_gradient_costs_no_point);
     RUN(an_upstream_gradient_that_is_not_finite_counts_as_zero);
+    RUN(an_upstream_gradient_that_overflows_is_left_out_and_counted);
     RUN(gradients_are_added_to_what_is_there);
     RUN(a_gradient_does_not_depend_on_which_others_are_wanted);
     RUN(what_backward_cannot_do_is_refused);

@@ -354,6 +354,12 @@ TEST(bad_descs_and_fields_are_refused)
     CHECK(!dist_mesh_extract(ctx, &field, &desc));
     CHECK_TEXT("refine is 9", dist_context_message(ctx));
     dist_context_clear(ctx);
+    const uint32_t nan = 0x7fc00000u;
+    desc = mesh_desc(16);
+    memcpy(&desc.level, &nan, sizeof nan);
+    CHECK(!dist_mesh_extract(ctx, &field, &desc));
+    CHECK_TEXT("level is nan", dist_context_message(ctx));
+    dist_context_clear(ctx);
     field.radius = 0;
     CHECK(!dist_mesh_extract(ctx, &field, NULL));
     CHECK_STATUS(DIST_BAD_ARGUMENT, dist_context_status(ctx), ctx);

@@ -643,6 +643,23 @@ TEST(saving_into_too_small_a_buffer_is_refused)
     case_close(&c);
 }
 
+TEST(a_file_that_takes_nothing_is_told_of)
+{
+    net_case c;
+    FILE *full = fopen("/dev/full", "rb");
+    if (!full) SKIP("there is no /dev/full");
+    fclose(full);
+    REQUIRE(case_open(&c, 11));
+    CHECK_STATUS(DIST_IO, dist_net_save_file(c.ctx, c.net, "/dev/full"), c.ctx);
+    CHECK_TEXT("dist_net_save_file", dist_context_message(c.ctx));
+    CHECK_TEXT("/dev/full", dist_context_message(c.ctx));
+    dist_context_clear(c.ctx);
+    CHECK(dist_net_load_file(c.ctx, "/dev") == NULL); /* a folder */
+    CHECK_STATUS(DIST_IO, dist_context_status(c.ctx), c.ctx);
+    CHECK_TEXT("/dev", dist_context_message(c.ctx));
+    case_close(&c);
+}
+
 TEST(a_net_saved_to_a_file_is_loaded_from_it)
 {
     net_case c;
@@ -1001,6 +1018,15 @@ TEST(a_layer_missing_in_the_middle_is_refused)
 {
     REFUSED(DIST_BAD_FILE, "", "",
             "lin0.weight 4 5;lin0.bias 4;lin1.weight 1 4;lin1.bias 1;lin3.weight 1 1;lin3.bias 1;");
+}
+
+TEST(a_net_of_more_layers_than_there_can_be_is_refused)
+{
+    char tensors[4096], *end = tensors;
+    for (int l = 0; l <= DISTI_MAX_LAYERS; l++)
+        end += sprintf(end, "lin%d.weight %d %d;lin%d.bias %d;", l, l < DISTI_MAX_LAYERS ? 4 : 1, l ? 4 : 5, l,
+                       l < DISTI_MAX_LAYERS ? 4 : 1);
+    REFUSED(DIST_UNSUPPORTED, "more than 32 layers", "", tensors);
 }
 
 TEST(metadata_that_means_nothing_is_refused_with_a_sentence)
@@ -1416,6 +1442,7 @@ int main(int argc, char **argv)
     RUN(rows_that_are_left_out_change_no_bit);
     RUN(a_saved_net_loads_and_saves_to_the_same_bytes_and_values);
     RUN(saving_into_too_small_a_buffer_is_refused);
+    RUN(a_file_that_takes_nothing_is_told_of);
     RUN(a_net_saved_to_a_file_is_loaded_from_it);
     RUN(a_geometric_start_is_near_the_distance_to_a_sphere_of_half_the_bound);
     RUN(a_seed_gives_the_same_net_and_another_seed_another);
@@ -1428,6 +1455,7 @@ int main(int argc, char **argv)
     RUN(the_least_numbers_a_file_may_say_are_floats);
     RUN(tensors_that_do_not_fit_are_refused_with_a_sentence);
     RUN(a_layer_missing_in_the_middle_is_refused);
+    RUN(a_net_of_more_layers_than_there_can_be_is_refused);
     RUN(metadata_that_means_nothing_is_refused_with_a_sentence);
     RUN(weights_that_are_not_finite_and_unknown_types_are_refused);
     RUN(a_file_cut_short_anywhere_is_refused);

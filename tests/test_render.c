@@ -912,6 +912,7 @@ TEST(render_refuses_null_and_garbage_with_a_sentence)
     dist_context *ctx = shape_context();
     dist_camera camera = shape_camera(8, 8);
     test_shape shape = some_shape(0);
+    const uint32_t nan = 0x7fc00000u;
     for (int k = 0; k < 8; k++) {
         dist_field field = shape_field(&shape, 1, 1);
         dist_render_desc how = plain_how();
@@ -929,6 +930,16 @@ TEST(render_refuses_null_and_garbage_with_a_sentence)
                      ctx);
         CHECK_TEXT("dist_render: ", dist_context_message(ctx));
         CHECK_TEXT(part, dist_context_message(ctx));
+        CHECK_EQUAL(0x5a, a.mask[0]);
+    }
+    for (int k = 0; k < 2; k++) {
+        dist_field field = shape_field(&shape, 1, 1);
+        dist_render_desc how = plain_how();
+        dist_images out = all_planes(&a);
+        memcpy(k ? &how.background_color[2] : &how.background, &nan, sizeof nan);
+        dist_context_clear(ctx);
+        CHECK_STATUS(DIST_NOT_FINITE, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+        CHECK_TEXT(k ? "how.background_color[2] is nan" : "how.background is nan", dist_context_message(ctx));
         CHECK_EQUAL(0x5a, a.mask[0]);
     }
     CHECK_EQUAL(DIST_BAD_ARGUMENT, dist_render(NULL, NULL, NULL, NULL, NULL, NULL));

@@ -1201,8 +1201,22 @@ TEST(colors_are_those_of_the_instance_that_is_hit)
     }
     all.color_fn(all.user, 0, N, points, color);
     CHECK_NEAR_ARRAY(3 * N, expected, color, 2e-6);
+    float far[2][3] = {{-40, 3, 0}, {50, 0, 2}}, nearest[6]; /* outside of both: the nearer one's, on its sphere */
+    for (int k = 0; k < 2; k++) {
+        float p[3] = {far[k][0] - 3.0f * (float)k, far[k][1], far[k][2]};
+        float share = fields[k].radius / (float)shape_length((double)p[0], (double)p[1], (double)p[2]);
+        for (int axis = 0; axis < 3; axis++) p[axis] *= share; /* its center is 0 */
+        fields[k].color_fn(fields[k].user, 0, 1, p, nearest + 3 * k);
+    }
+    CHECK_STATUS(DIST_OK, dist_color_eval(ctx, &all, 2, far[0], color), ctx);
+    CHECK_NEAR_ARRAY(6, nearest, color, 2e-6);
     float sphere[4] = {0, 0, 0, 0.5f};
-    dist_field plain = dist_field_sphere(sphere);
+    dist_field plain = dist_field_sphere(sphere), bare = fields[1];
+    bare.color_fn = NULL;
+    two[1].field = &bare;
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_scene_set(scene, 1, &two[1]), ctx);
+    CHECK_TEXT("what the instance has of color must stay what it was", dist_context_message(ctx));
+    dist_context_clear(ctx);
     two[1].field = &plain;
     dist_scene *mixed = dist_scene_create(ctx, 2, two);
     CHECK(dist_scene_field(mixed).color_fn == NULL);

@@ -1400,7 +1400,8 @@ TEST(trace_refuses_what_it_cannot_trace)
     dist_context *ctx = shape_context();
     test_shape shape = shape_make(SHAPE_SPHERE, 0.5, 0, 0, 0);
     const float o[3] = {0, 0, 2}, d[3] = {0, 0, -1};
-    for (int k = 0; k < 20; k++) {
+    const unsigned char pixel = 1;
+    for (int k = 0; k < 21; k++) {
         dist_field field = shape_field(&shape, 1, 1);
         dist_render_desc how = plain_how();
         const char *part = "field";
@@ -1426,6 +1427,7 @@ TEST(trace_refuses_what_it_cannot_trace)
         if (k == 17) how.normal_delta = -1, part = "normal_delta";
         if (k == 18) field.certified = -1, part = "field.certified";
         if (k == 19) field.certified_far = test_nan(), part = "field.certified_far";
+        if (k == 20) how.pixels = &pixel, part = "how.pixels is for pictures";
         dist_context_clear(ctx);
         shape.queries = 0;
         CHECK_STATUS(DIST_BAD_ARGUMENT,

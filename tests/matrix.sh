@@ -153,6 +153,17 @@ else
     skip_row aarch64 "aarch64-linux-gnu-gcc and qemu-aarch64 are not both installed"
 fi
 if [ -z "$quick" ]; then
+    if have riscv64-linux-gnu-gcc && have qemu-riscv64; then
+        row riscv64 build/matrix/riscv64 riscv64-linux-gnu-gcc "-O2 -static" "" 1 qemu-riscv64
+    else
+        skip_row riscv64 "riscv64-linux-gnu-gcc and qemu-riscv64 are not both installed"
+    fi
+    wasm="--target=wasm32-wasi --sysroot=/usr -O2 -D_WASI_EMULATED_PROCESS_CLOCKS -lwasi-emulated-process-clocks"
+    if have node && can clang $wasm; then # clang 14 with -msimd128 needs -fno-slp-vectorize: it breaks a sum of the tests
+        row wasm build/matrix/wasm clang "$wasm -Wl,-z,stack-size=1048576" "" 1 "node --no-warnings tests/wasi.mjs"
+    else
+        skip_row wasm "clang for WebAssembly, wasi-libc and node are not all installed"
+    fi
     wine=$(command -v wine64 || command -v wine || ls /usr/lib/wine/wine64 2>/dev/null)
     if have x86_64-w64-mingw32-gcc && [ -n "$wine" ]; then
         set -- $(basename -s .c tests/test_*.c)

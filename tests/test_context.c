@@ -7,6 +7,11 @@
 #include <xmmintrin.h>
 #else
 #include <fenv.h>
+#ifndef FE_UPWARD /* WebAssembly rounds to nearest only */
+#define FE_UPWARD FE_TONEAREST
+#define FE_DOWNWARD FE_TONEAREST
+#define FE_TOWARDZERO FE_TONEAREST
+#endif
 #endif
 
 enum { W = 40, H = 30, CODE = 3 };

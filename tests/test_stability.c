@@ -7,6 +7,11 @@
 #include "shapes.h"
 
 #include <fenv.h>
+#ifndef FE_UPWARD /* WebAssembly rounds to nearest only */
+#define FE_UPWARD FE_TONEAREST
+#define FE_DOWNWARD FE_TONEAREST
+#define FE_TOWARDZERO FE_TONEAREST
+#endif
 #if defined(__SSE__)
 #include <xmmintrin.h>
 #endif

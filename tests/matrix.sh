@@ -160,7 +160,7 @@ if [ -z "$quick" ]; then
         skip_row riscv64 "riscv64-linux-gnu-gcc and qemu-riscv64 are not both installed"
     fi
     wasm="--target=wasm32-wasi --sysroot=/usr -O2 -D_WASI_EMULATED_PROCESS_CLOCKS -lwasi-emulated-process-clocks"
-    if have node && can clang $wasm; then # clang 14 with -msimd128 needs -fno-slp-vectorize: it breaks a sum of the tests
+    if have node && can clang $wasm; then
         row wasm build/matrix/wasm clang "$wasm -Wl,-z,stack-size=1048576" "" 1 "node --no-warnings tests/wasi.mjs"
     else
         skip_row wasm "clang for WebAssembly, wasi-libc and node are not all installed"

@@ -1494,7 +1494,7 @@ TEST(an_upstream_gradient_that_is_not_finite_counts_as_zero)
     }
 }
 
-/* Over |n . v| = .7 a finite weight may become infinite. */
+/* Those of depth and distance add up, and are divided by |n . v|: of finite ones comes an infinite one. */
 TEST(an_upstream_gradient_that_overflows_is_left_out_and_counted)
 {
     scene s;

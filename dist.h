@@ -11119,10 +11119,11 @@ typedef struct disti_cone {
 
 enum {
     DISTI_CONE_FIRST = 32,
+    DISTI_CONE_WARM = 128, /* the first of a warm start: all of a tile */
     DISTI_CONE_LEAF = 4,
     DISTI_CONE_RAYS = 4, /* fewer march by themselves */
     DISTI_CONE_OUTLINE = 2, /* where the outline passes, if balls are not worth it */
-    DISTI_CONES_MOST = 9 * (1 + 4 + 16 + 64 + 256)
+    DISTI_CONES_MOST = 1 + 4 + 9 + 36 + 121 + 484 + 1936 /* down to 2 pixels, in a tile of 88 */
 };
 
 enum { DISTI_CONE_THROUGH, DISTI_CONE_BLOCKED, DISTI_CONE_SPLIT, DISTI_CONE_MARCHES };
@@ -11297,11 +11298,10 @@ static void disti_cone_rounds(const disti_tracer *tracer, int worker, const dist
     }
 }
 
-/* Adds the tile's largest blocks, 32 pixels. */
-static void disti_cones_first(const disti_tracer *tracer, const disti_tile *tile, disti_bench *bench, int leaf,
-                              size_t *listed)
+/* Adds the tile's blocks of `first` pixels, or what is enough for all of it. */
+static void disti_cones_first(const disti_tracer *tracer, const disti_tile *tile, disti_bench *bench, int first,
+                              int leaf, size_t *listed)
 {
-    int first = DISTI_CONE_FIRST;
     while (first > leaf && first / 2 >= DISTI_MAX(tile->own_width, tile->own_height)) first /= 2;
     for (int y = 0; y < tile->own_height; y += first)
         for (int x = 0; x < tile->own_width; x += first)
@@ -11318,7 +11318,7 @@ static int disti_cones(const disti_tracer *tracer, int worker, const disti_tile 
     size_t active = 0;
     int blocked = 0;
     DIST_ASSERT((size_t)DISTI_CONES_MOST * sizeof(disti_cone) <= (size_t)DISTI_REST_BYTES);
-    if (!known) disti_cones_first(tracer, tile, bench, leaf, &active);
+    if (!known) disti_cones_first(tracer, tile, bench, (int)DISTI_CONE_FIRST, leaf, &active);
     for (; known && known->size > 0; known++) cones[bench->cones++] = *known;
     disti_cone_rounds(tracer, worker, tile, bench, &bench->cones, active, leaf);
     for (int i = 0; i < bench->cones; i++) blocked += cone[i].state == DISTI_CONE_BLOCKED;
@@ -12126,8 +12126,8 @@ enum { DISTI_TAPE_HIT = 16, DISTI_TAPE_SAMPLE = 32, DISTI_TAPE_NEAR = 64, DISTI_
    of a picture, whatever its tiles. */
 static int disti_tile_cones(int tile)
 {
-    int across = (tile + (int)DISTI_CONE_FIRST - 1) / (int)DISTI_CONE_FIRST;
-    return across * across * 16 + 1;
+    int across = (tile + (int)DISTI_LATTICE - 1) / (int)DISTI_LATTICE;
+    return across * across + 1;
 }
 
 /* The smallest tiles of a picture, the paper's tracer's apart: it should have some for every worker. */
@@ -12569,23 +12569,25 @@ static void disti_tile_trim(const disti_render_job *job, disti_tile *tile, const
    are. A quarter of them takes one query there (a step of Newton's with the last slope ends it, as for a cold
    prediction), or a quarter of those where the corners around moved alike to within epsilon; the others lie between
    such that moved alike, and are moved with them, else they take a query, too. The quarters take turns, so no error
-   lives longer than 15 turns.
+   lives longer than 15 turns. What Newton's steps do not end is bracketed, or marches on from there.
    Misses. Where the cones stopped again, the least |f| is known to within what the change of f at the hits around takes
    off it each turn (disti_warm_loss), or with a silhouette to within what disti_warm_drifts interpolates. Once that
    may have brought it near, f is asked for where it was least, and when it is near, by samples on both sides how low it
-   is now: a crossing is bracketed on the spot, what stays undecided is marched.
+   is now: a crossing is bracketed on the spot, what stays undecided is marched. Without a silhouette these wait a few
+   turns where f has hardly changed, as on a plateau near 0.
    What has a nearer hit beside it, not of the same slant, may be covered by that: from the nearer one's distance on,
    the least f is looked for likewise, again when the bound found is used up; misses take turns at it, and hits while
    the picture moves little.
    Rays that start inside do so until the change of f may have brought them out.
    All is off for rays where f at the cones' stop is too small for the surface expected (as in disti_predict) and the
    cones prove less to be empty than when the ray was traced, for tiles where the first pixels contradict what is
-   expected, and around those of the pixels marched anew (one hit in 128 each turn, down to one in 512) that do. */
+   expected, and around those of the pixels marched anew (one hit in 128 each turn, down to one in 512) that do; a hit
+   marched anew is verified as the others are once nothing nearer can be in its way. */
 enum { DISTI_WARM_HITS = 128, DISTI_WARM_MISSES = 64, DISTI_WARM_MINIMA = 8 };
 
 /* What a ray is asked for: a step of Newton's, how f has changed where it was least, whether that is still a miss (the
    next stage waits for these three), spheres beside a nearer surface, how close it passes by one, anew, and anew to see
-   whether that is where it was expected (or has been, and that is known). */
+   whether that is where it was expected (known: it has been, or marches on from where it was looked for). */
 enum {
     DISTI_ASK_NOTHING,
     DISTI_ASK_NEWTON,
@@ -12630,10 +12632,12 @@ static unsigned disti_warm_calm(float change, float radius)
 }
 
 /* Whether it is the pixel's turn to be marched anew: one of each 8 x 16 block (period 128), scattered, up to one of
-   each 16 x 32; no later than that where `calm` changes meanwhile. */
-static int disti_warm_due(const disti_warm *warm, int i, unsigned period)
+   each 16 x 32; no later than that where `calm` changes meanwhile. Misses take turns twice as often as hits where the
+   picture moves. */
+static int disti_warm_due(const disti_warm *warm, int i, int miss)
 {
     unsigned x = (unsigned)(i % warm->tile->width), y = (unsigned)(i / warm->tile->width);
+    unsigned period = miss && warm->calm == 1 ? (unsigned)DISTI_WARM_MISSES : (unsigned)DISTI_WARM_HITS;
     unsigned place = x % 8u + y % 16u * 8u + x / 8u % 2u * 128u + y / 16u % 2u * 256u;
     return (place * 27u + warm->tape->turn) % (period * warm->calm) == 0;
 }
@@ -12650,7 +12654,7 @@ static int disti_warm_reaches(const disti_warm *warm, int i)
 static int disti_warm_falls(const disti_warm *warm, size_t pixel)
 {
     float slope = warm->tape->value[pixel], lipschitz = warm->tracer->lipschitz;
-    return slope < -2e-3f * lipschitz && slope > -4.0f * lipschitz;
+    return slope < -2e-4f * lipschitz && slope > -4.0f * lipschitz;
 }
 
 /* Whether the ray may be looked for near its last hit s. */
@@ -12663,6 +12667,12 @@ static int disti_warm_expects(const disti_warm *warm, int i, float s)
     if (!disti_warm_falls(warm, pixel) || !(s > ray->enter && s < ray->leave)) return 0;
     if (ray->guard > 2e38f) return 0; /* no cone came here */
     return -slope * (s - ray->start) <= ray->guard || disti_warm_reaches(warm, i);
+}
+
+/* What ends this much nearer than expected is another surface. */
+static float disti_warm_far(const disti_warm *warm)
+{
+    return 0.01f * warm->tracer->field->radius + 4.0f * warm->change;
 }
 
 static void disti_warm_change(disti_warm *warm, float change)
@@ -12698,6 +12708,27 @@ static int disti_warm_again(disti_warm *warm, int i)
     return disti_predict(warm->tracer, warm->tile, warm->bench, i % warm->tile->width, i / warm->tile->width, 1);
 }
 
+/* Ray i goes on as if it had been marched to s, where f was found. */
+static int disti_warm_resume(disti_warm *warm, int i, float s, float f)
+{
+    disti_ray *ray = &warm->bench->rays[i];
+    disti_warm_again(warm, i);
+    warm->ask[i] = DISTI_ASK_KNOWN;
+    ray->q = s;
+    if (disti_ray_advance(warm->tracer, ray, f)) return 1;
+    warm->bench->depth[i] = disti_hit_depth(ray);
+    return 0;
+}
+
+/* The crossing of ray i lies between a and b, fa > 0 >= fb. */
+static int disti_warm_crosses(disti_warm *warm, int i, float a, float fa, float b, float fb)
+{
+    disti_ray *ray = &warm->bench->rays[i];
+    warm->ask[i] = DISTI_ASK_NEAR;
+    ray->moved = 0;
+    return disti_ray_open_bracket(warm->tracer, ray, a, fa, b, fb);
+}
+
 static void disti_warm_hit(disti_warm *warm, int i, float s, float f, float error)
 {
     disti_ray *ray = &warm->bench->rays[i];
@@ -12708,12 +12739,12 @@ static void disti_warm_hit(disti_warm *warm, int i, float s, float f, float erro
 }
 
 /* The sample f of a step of Newton's, the first with the last slope, then with the ray's own. What does not end within
-   four is traced anew. */
+   four is bracketed if the last two differ in sign, else it marches on from here. */
 static int disti_warm_newton(disti_warm *warm, int i, float f)
 {
     disti_ray *ray = &warm->bench->rays[i];
-    float far = 0.03f * warm->tracer->field->radius, flat = -2e-3f * warm->tracer->lipschitz;
-    float epsilon = disti_ray_epsilon(warm->tracer, ray, ray->q);
+    float far = 0.03f * warm->tracer->field->radius, flat = -2e-4f * warm->tracer->lipschitz;
+    float epsilon = disti_ray_epsilon(warm->tracer, ray, ray->q), at = ray->q, before = ray->a, other = ray->fa;
     int first = ray->steps++ == 0, steep;
     float slope = first ? ray->slope : (f - ray->fa) / (ray->q - ray->a), step = -f / slope;
     float length = step < 0.0f ? -step : step, moved = ray->q + step - warm->tape->s[disti_warm_pixel(warm, i)];
@@ -12729,7 +12760,12 @@ static int disti_warm_newton(disti_warm *warm, int i, float f)
         disti_warm_change(warm, moved * slope);
         return 0;
     }
-    return good && ray->steps < 4 ? 1 : disti_warm_again(warm, i);
+    if (good && ray->steps < 4) return 1;
+    if (!first && f > 0.0f && other <= 0.0f && before > at)
+        return disti_warm_crosses(warm, i, at, f, before, other);
+    if (!first && f <= 0.0f && other > 0.0f && before < at)
+        return disti_warm_crosses(warm, i, before, other, at, f);
+    return disti_warm_resume(warm, i, at, f);
 }
 
 /* Where f changes alike, hits move by that over their slopes: how much more i moves than k. Else (`slopes` 0) alike. */
@@ -12823,7 +12859,7 @@ static void disti_warm_hits(disti_warm *warm, int pass)
             *least = apart;
         }
         if (move > 2e38f) move = 0.0f;
-        if (!disti_warm_expects(warm, i, s + move) || disti_warm_due(warm, i, DISTI_WARM_HITS)) continue;
+        if (!disti_warm_expects(warm, i, s + move) || disti_warm_due(warm, i, 0)) continue;
         disti_ray *ray = &warm->bench->rays[i];
         float epsilon = disti_ray_epsilon(warm->tracer, ray, s);
         ray->slope = warm->tape->value[pixel];
@@ -12838,7 +12874,7 @@ static void disti_warm_hits(disti_warm *warm, int pass)
     }
 }
 
-/* Whether half of the `tried` first hits were found, and f has changed little there. */
+/* Whether a third of the `tried` first hits were found, and f has changed little there. */
 static int disti_warm_good(disti_warm *warm, size_t tried)
 {
     size_t good = 0;
@@ -12850,7 +12886,7 @@ static int disti_warm_good(disti_warm *warm, size_t tried)
         good++;
     }
     warm->typical = good > 0 ? sum / (float)good : 0.0f;
-    return 2 * good >= tried && warm->typical <= 8e-3f * warm->tracer->field->radius;
+    return 3 * good >= tried && warm->typical <= 8e-3f * warm->tracer->field->radius;
 }
 
 /* Whether it is the tile's turn to have all of its least |f| looked for anew, in 2 to 8 turns: before the picture has
@@ -12863,10 +12899,18 @@ static int disti_warm_minima_due(const disti_warm *warm, float change)
     return !warm->tape->has_silhouette || (x * 5u + y * 3u + warm->tape->turn) % period == 0;
 }
 
+/* Whether a hit that a nearer surface may cover has come down to what it is itself, which is known. */
+static int disti_warm_own(const disti_ray *ray)
+{
+    return ray->moved && ray->status == DIST_RAY_HIT && ray->s + ray->width >= ray->best;
+}
+
 /* One sample f at ray->q of a ray that passes close by a surface; ray->s, f: the lowest one so far. Samples on both
-   sides, in strides that double, until both are higher, and then in narrower ones around where the parabola through the
-   three is lowest, until it is known how low that is. 0: it is more than `least`; below 0: the crossing is bracketed.
-   1: another query; -1: undecided. */
+   sides, in strides that double (downhill the one behind is known: it was where the last began), until both are higher,
+   and then in narrower ones around where the parabola through the three is lowest, until it is known how low that is.
+   ray->side: 0 the first of two, 1 the second, 2 where the parabola is lowest, 3 the only one, before ray->fb.
+   Returns 0: it is more than `least`, or the ray's own hit; below 0: the crossing is bracketed. 1: another query; -1:
+   undecided. */
 static int disti_warm_pass(const disti_warm *warm, disti_ray *ray, float f, float least)
 {
     ray->steps++;
@@ -12876,10 +12920,12 @@ static int disti_warm_pass(const disti_warm *warm, disti_ray *ray, float f, floa
         ray->width = DISTI_MAX(1.5f * -f / warm->tracer->lipschitz, 0.25f * ray->width);
         return disti_ray_ask(ray, DISTI_BACK, DISTI_MAX(ray->q - ray->width, ray->enter));
     }
-    if (ray->side == 0) { /* the other side */
+    if (ray->side == 0 || ray->side == 3) { /* the other side */
+        int known = ray->side == 3;
         ray->side = 1;
         ray->fa = f;
-        return disti_ray_ask(ray, DISTI_WAIT, DISTI_MIN(ray->s + ray->width, ray->leave));
+        if (!known) return disti_ray_ask(ray, DISTI_WAIT, DISTI_MIN(ray->s + ray->width, ray->leave));
+        f = ray->fb;
     }
     if (ray->side == 1 && ray->fa >= ray->f && f >= ray->f) {
         float curvature = ray->fa - 2.0f * ray->f + f, rise = DISTI_MAX(ray->fa, f) - ray->f;
@@ -12900,13 +12946,20 @@ static int disti_warm_pass(const disti_warm *warm, disti_ray *ray, float f, floa
         ray->f = DISTI_MIN(ray->f, f);
         ray->width *= 0.25f;
         if (ray->width < 0.25f * least) return ray->f > least ? 0 : -1;
+        ray->side = 0;
     } else {
-        ray->s += ray->fa < f ? -ray->width : ray->width;
-        ray->f = DISTI_MIN(ray->fa, f);
+        int back = ray->fa < f;
+        ray->s += back ? -ray->width : ray->width;
+        ray->f = back ? ray->fa : f;
+        ray->fb = f;
         ray->width *= 2.0f;
+        ray->side = back ? 3 : 1;
     }
-    ray->side = 0;
     if (ray->steps > 24 || ray->s <= ray->enter || ray->s >= ray->leave) return -1;
+    if (ray->side == 1) {
+        if (disti_warm_own(ray)) return 0;
+        return disti_ray_ask(ray, DISTI_WAIT, DISTI_MIN(ray->s + ray->width, ray->leave));
+    }
     return disti_ray_ask(ray, DISTI_WAIT, DISTI_MAX(ray->s - ray->width, ray->enter));
 }
 
@@ -12934,7 +12987,7 @@ static int disti_warm_misses_still(const disti_warm *warm, int i)
         return !warm->open[i] && ray->status == DIST_RAY_MISS && ray->enter < ray->leave;
     /* the cones went through here: nothing is known of a ray that they do not clear any more */
     if (!(warm->tape->value[pixel] > 0.0f) && warm->tape->start[pixel] <= ray->enter) return 0;
-    return !(ray->guard > 2e38f) && disti_warm_reaches(warm, i) && !disti_warm_due(warm, i, DISTI_WARM_MISSES);
+    return !(ray->guard > 2e38f) && disti_warm_reaches(warm, i) && !disti_warm_due(warm, i, 1);
 }
 
 /* Change of the least f of miss i between nodes h pixels apart, as far as all four are known and changed alike: to
@@ -13061,8 +13114,10 @@ static int disti_warm_least(disti_warm *warm, int i, float f)
     disti_ray *ray = &warm->bench->rays[i];
     float epsilon = disti_ray_epsilon(warm->tracer, ray, ray->best), radius = warm->tracer->field->radius;
     float margin = 5.0f * (warm->change + epsilon), value = warm->tape->value[disti_warm_pixel(warm, i)];
-    int odd = (i + i / warm->tile->width + (int)(warm->tape->turn & 1u)) & 1;
-    int still = !warm->silhouette && warm->change < 1e-3f * radius && odd && value > 0.0f && f > 3.0f * epsilon;
+    unsigned turn = (unsigned)(i + i / warm->tile->width) + warm->tape->turn;
+    int same = f > 0.9f * value && f < 1.1f * value && turn % 8u != 0; /* as where a plateau all but reaches 0 */
+    int still = !warm->silhouette && warm->change < 1e-3f * radius && value > 0.0f &&
+                (same || (turn % 2u && f > 3.0f * epsilon));
     if (!(warm->silhouette && value > 0.0f)) margin += 0.03f * radius; /* the bound is used up: a new one */
     ray->f = f;
     ray->s = ray->best;
@@ -13078,12 +13133,16 @@ static int disti_warm_sphere(disti_warm *warm, int i, float f)
     disti_ray *ray = &warm->bench->rays[i];
     int hit = ray->status == DIST_RAY_HIT, more;
     float epsilon = disti_ray_epsilon(warm->tracer, ray, ray->q), before = ray->f;
+    float *bound = &warm->tape->beside[disti_warm_pixel(warm, i)];
     float away = hit ? 0.5f * warm->change + 2.0f * epsilon : 0.03f * warm->tracer->field->radius;
     ray->f = f;
     ray->s = ray->q;
-    if (!(f > away) || ray->steps++ > 7) return disti_warm_approach(warm, i);
+    if (!(f > away) || ray->steps++ > 7) {
+        *bound = DISTI_MAX(0.5f * f, 0.0f); /* if it meets no other */
+        return disti_warm_approach(warm, i);
+    }
     more = hit && f < before && f < -0.7f * ray->slope * (ray->best - ray->q);
-    if (!more) warm->tape->beside[disti_warm_pixel(warm, i)] = 0.5f * DISTI_MIN(f, before); /* of this one and before */
+    if (!more) *bound = 0.5f * DISTI_MIN(f, before); /* of this one and before */
     ray->q += f / warm->tracer->lipschitz;
     return more;
 }
@@ -13093,8 +13152,10 @@ static int disti_warm_near(disti_warm *warm, int i, float f)
 {
     disti_ray *ray = &warm->bench->rays[i];
     float least = 2.0f * disti_ray_epsilon(warm->tracer, ray, ray->s) + 0.1f * warm->change;
+    float *bound = &warm->tape->beside[disti_warm_pixel(warm, i)];
     int more = ray->mode == DISTI_WAIT ? disti_warm_pass(warm, ray, f, least) : disti_ray_advance(warm->tracer, ray, f);
     if (more > 0) return 1;
+    if (more < 0 || ray->mode != DISTI_WAIT) *bound = 0.0f;
     if (more < 0) return disti_warm_again(warm, i);
     ray->kept = 1;
     if (ray->mode != DISTI_WAIT) {
@@ -13104,12 +13165,24 @@ static int disti_warm_near(disti_warm *warm, int i, float f)
         float off = ray->s - ray->best, other = 0.01f * warm->tracer->field->radius;
         int same = ray->status == DIST_RAY_MISS && off < ray->width && -off < ray->width;
         ray->mode = DISTI_DONE; /* a miss that came down to its least, which has a bound of its own, met no other */
-        warm->tape->beside[disti_warm_pixel(warm, i)] = same ? DISTI_MAX(ray->f, other) : ray->f;
+        if (!disti_warm_own(ray)) *bound = same ? DISTI_MAX(ray->f, other) : ray->f;
     } else {
         disti_ray_end(ray, DIST_RAY_MISS, ray->s, ray->f, 0.0f);
         return disti_warm_beside(warm, i, 0);
     }
     return 0;
+}
+
+/* Whether a hit that is marched anew has met nothing nearer (disti_warm_doubt) on its way to where it is expected: then
+   that is verified as it is for the others. */
+static int disti_warm_arrives(const disti_warm *warm, int i)
+{
+    size_t pixel = disti_warm_pixel(warm, i);
+    const disti_ray *ray = &warm->bench->rays[i];
+    float s = warm->tape->s[pixel];
+    if (warm->ask[i] != DISTI_ASK_REFRESH || warm->moved[i] < 2e38f) return 0;
+    if ((warm->tape->status[pixel] & 15) != DIST_RAY_HIT || !disti_warm_falls(warm, pixel)) return 0;
+    return (ray->mode == DISTI_MARCH || ray->mode == DISTI_JUMP) && ray->s < s && ray->s > s - disti_warm_far(warm);
 }
 
 static void disti_warm_drifted(disti_warm *warm, int i, float f)
@@ -13136,7 +13209,14 @@ static int disti_warm_take(disti_warm *warm, int i, float f)
     if (ask == DISTI_ASK_BESIDE) return disti_warm_sphere(warm, i, f);
     if (ask == DISTI_ASK_NEAR) return disti_warm_near(warm, i, f);
     disti_stats_slope(warm->tracer, ray, f, bench->stats);
-    if (disti_ray_advance(warm->tracer, ray, f)) return 1;
+    if (disti_ray_advance(warm->tracer, ray, f)) {
+        if (!disti_warm_arrives(warm, i)) return 1;
+        ray->slope = warm->tape->value[disti_warm_pixel(warm, i)];
+        ray->q = warm->tape->s[disti_warm_pixel(warm, i)];
+        ray->steps = 0;
+        warm->ask[i] = DISTI_ASK_NEWTON;
+        return 1;
+    }
     bench->depth[i] = disti_hit_depth(ray);
     return 0;
 }
@@ -13214,7 +13294,7 @@ static void disti_warm_refresh(disti_warm *warm, int i, float s)
 static void disti_warm_doubt(disti_warm *warm)
 {
     const disti_bench *bench = warm->bench;
-    float far = 0.01f * warm->tracer->field->radius + 4.0f * warm->change;
+    float far = disti_warm_far(warm);
     int width = warm->tile->width;
     for (int at = 0; at < warm->n; at++) {
         const disti_ray *ray = &bench->rays[at];
@@ -13231,6 +13311,12 @@ static void disti_warm_doubt(disti_warm *warm)
             disti_warm_refresh(warm, i, beside->status == DIST_RAY_HIT ? beside->best : beside->leave);
         }
     }
+}
+
+/* Whether ray i is on the list, for other than what disti_render_warm still lists. */
+static int disti_warm_listed(const disti_warm *warm, int i)
+{
+    return warm->ask[i] >= DISTI_ASK_LEAST && warm->ask[i] != DISTI_ASK_MARCH;
 }
 
 static void disti_render_warm(const disti_render_job *job, int worker, const disti_tile *tile, const disti_bench *bench)
@@ -13261,7 +13347,7 @@ static void disti_render_warm(const disti_render_job *job, int worker, const dis
     for (int i = 0; i < warm.n; i++) { /* those whose turn it is march beside all that follows */
         size_t pixel = disti_warm_pixel(&warm, i);
         int miss = (warm.tape->status[pixel] & 15) == DIST_RAY_MISS;
-        if (!warm.open[i] || !disti_warm_due(&warm, i, miss ? DISTI_WARM_MISSES : DISTI_WARM_HITS)) continue;
+        if (!warm.open[i] || !disti_warm_due(&warm, i, miss)) continue;
         if (miss || disti_warm_expects(&warm, i, warm.tape->s[pixel])) disti_warm_refresh(&warm, i, 3e38f);
     }
     before = warm.count;
@@ -13277,15 +13363,16 @@ static void disti_render_warm(const disti_render_job *job, int worker, const dis
     }
     if (good) disti_warm_misses(&warm);
     for (int i = 0; i < warm.n && good; i++) {
-        if (warm.ask[i] == DISTI_ASK_LEAST) disti_warm_clear(&warm, i, 1); /* its own turn comes with its sample */
-        if (warm.ask[i] == DISTI_ASK_REFRESH || warm.ask[i] == DISTI_ASK_LEAST) continue;
+        if (disti_warm_listed(&warm, i)) { /* its turn comes with its end, if any */
+            disti_warm_clear(&warm, i, 1);
+            continue;
+        }
         if (disti_warm_beside(&warm, i, 1)) disti_warm_list(&warm, i, DISTI_ASK_BESIDE, bench->rays[i].q);
         left += bench->rays[i].mode != DISTI_DONE;
     }
     warm.late = good && left * 32 < (size_t)warm.n;
     for (int i = 0; i < warm.n; i++) {
-        int listed = warm.ask[i] >= DISTI_ASK_LEAST && warm.ask[i] != DISTI_ASK_MARCH;
-        if (good ? listed || bench->rays[i].mode == DISTI_DONE : !warm.open[i]) continue;
+        if (good ? disti_warm_listed(&warm, i) || bench->rays[i].mode == DISTI_DONE : !warm.open[i]) continue;
         if (disti_warm_again(&warm, i)) disti_warm_list(&warm, i, DISTI_ASK_MARCH, bench->rays[i].q);
     }
     do {
@@ -13403,17 +13490,18 @@ static void disti_cones_task(void *arg, int index, int worker)
     disti_tile tiles[DISTI_CONE_TILES];
     size_t active = 0, each = (size_t)disti_tile_cones(job->tile);
     int first = index * (int)DISTI_CONE_TILES, count = DISTI_MIN(job->count - first, (int)DISTI_CONE_TILES);
+    int leaf = job->least ? (int)DISTI_LATTICE : 2 * (int)DISTI_LATTICE; /* the silhouette is made from theirs, too */
     memset(tiles, 0, sizeof tiles);
     disti_bench_init(job->tracer->ctx, worker, &bench);
     disti_cone *cones = (disti_cone *)(void *)bench.rest, *to[DISTI_CONE_TILES];
     for (int i = 0; i < count; i++) {
         int before = bench.cones;
         disti_tile_init(job, first + i, &tiles[i]);
-        disti_cones_first(job->tracer, &tiles[i], &bench, (int)DISTI_LATTICE, &active);
+        disti_cones_first(job->tracer, &tiles[i], &bench, (int)DISTI_CONE_WARM, leaf, &active);
         for (int k = before; k < bench.cones; k++) cones[k].tile = i;
         to[i] = job->tape->cones + (size_t)(first + i) * each;
     }
-    disti_cone_rounds(job->tracer, worker, tiles, &bench, &bench.cones, active, (int)DISTI_LATTICE);
+    disti_cone_rounds(job->tracer, worker, tiles, &bench, &bench.cones, active, leaf);
     for (int k = 0; k < bench.cones; k++)
         if (cones[k].state != DISTI_CONE_SPLIT) *to[cones[k].tile]++ = cones[k];
     for (int i = 0; i < count; i++) to[i]->size = 0;

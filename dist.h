@@ -660,13 +660,14 @@ typedef struct dist_tape dist_tape;
    It is meant for an optimization that moves the surface by less than about a pixel a step. Whatever does not
    verify, and every tile in which much has moved, is traced anew; so is the whole picture after a change of camera, of
    field (the shape itself may get a new code) or of epsilon. What is certain: what lies before the cones' stops (blocks
-   of 8 x 8 pixels) is empty as far as the Lipschitz figure is right, as in a cold render. Every hit lies on the surface
-   within its error bound, but those without a query, moved as their neighbors are and asked within 16 renders, only
-   where neighbors see alike: not where the surface has bumps finer than two pixels. Between the cones' stop and the
-   hit a surface that comes out of nothing is noticed at once if f where the cones stop betrays it, else by the rays
-   that are marched anew in turn: a pixel after 512 renders at the latest (256 if it was a miss), after 128 (64) if f at
-   the picture's hits changes by more than 0.0004 of the radius a render, on average. What such a ray finds is followed
-   to its neighbors, within a tile at once where it is nearer by a hundredth of the radius, else pixel by pixel. */
+   of 16 x 16 pixels, 8 x 8 with a silhouette) is empty as far as the Lipschitz figure is right, as in a cold render.
+   Every hit lies on the surface within its error bound, but those without a query, moved as their neighbors are and
+   asked within 16 renders, only where neighbors see alike: not where the surface has bumps finer than two pixels.
+   Between the cones' stop and the hit a surface that comes out of nothing is noticed at once if f where the cones stop
+   betrays it, else by the rays that are marched anew in turn: a pixel after 512 renders at the latest (256 if it was a
+   miss), after 128 (64) if f at the picture's hits changes by more than 0.0004 of the radius a render, on average. What
+   such a ray finds is followed to its neighbors, within a tile at once where it is nearer by a hundredth of the radius,
+   else pixel by pixel. */
 DIST_API dist_tape *dist_tape_create(dist_context *ctx, const dist_camera *camera, const dist_render_desc *desc);
 DIST_API void dist_tape_destroy(dist_tape *tape);
 
@@ -12632,12 +12633,10 @@ static unsigned disti_warm_calm(float change, float radius)
 }
 
 /* Whether it is the pixel's turn to be marched anew: one of each 8 x 16 block (period 128), scattered, up to one of
-   each 16 x 32; no later than that where `calm` changes meanwhile. Misses take turns twice as often as hits where the
-   picture moves. */
-static int disti_warm_due(const disti_warm *warm, int i, int miss)
+   each 16 x 32; no later than that where `calm` changes meanwhile. */
+static int disti_warm_due(const disti_warm *warm, int i, unsigned period)
 {
     unsigned x = (unsigned)(i % warm->tile->width), y = (unsigned)(i / warm->tile->width);
-    unsigned period = miss && warm->calm == 1 ? (unsigned)DISTI_WARM_MISSES : (unsigned)DISTI_WARM_HITS;
     unsigned place = x % 8u + y % 16u * 8u + x / 8u % 2u * 128u + y / 16u % 2u * 256u;
     return (place * 27u + warm->tape->turn) % (period * warm->calm) == 0;
 }
@@ -12859,7 +12858,7 @@ static void disti_warm_hits(disti_warm *warm, int pass)
             *least = apart;
         }
         if (move > 2e38f) move = 0.0f;
-        if (!disti_warm_expects(warm, i, s + move) || disti_warm_due(warm, i, 0)) continue;
+        if (!disti_warm_expects(warm, i, s + move) || disti_warm_due(warm, i, DISTI_WARM_HITS)) continue;
         disti_ray *ray = &warm->bench->rays[i];
         float epsilon = disti_ray_epsilon(warm->tracer, ray, s);
         ray->slope = warm->tape->value[pixel];
@@ -12987,7 +12986,7 @@ static int disti_warm_misses_still(const disti_warm *warm, int i)
         return !warm->open[i] && ray->status == DIST_RAY_MISS && ray->enter < ray->leave;
     /* the cones went through here: nothing is known of a ray that they do not clear any more */
     if (!(warm->tape->value[pixel] > 0.0f) && warm->tape->start[pixel] <= ray->enter) return 0;
-    return !(ray->guard > 2e38f) && disti_warm_reaches(warm, i) && !disti_warm_due(warm, i, 1);
+    return !(ray->guard > 2e38f) && disti_warm_reaches(warm, i) && !disti_warm_due(warm, i, DISTI_WARM_MISSES);
 }
 
 /* Change of the least f of miss i between nodes h pixels apart, as far as all four are known and changed alike: to
@@ -13046,10 +13045,13 @@ static float disti_warm_loss(const disti_warm *warm, int i, float s)
 }
 
 /* The misses. Without a silhouette |f| is known not to be below tape->value less what has changed since; with one it is
-   known by disti_warm_drifts. Where it may be near 0 it is asked for, and looked at on both sides. */
-static void disti_warm_misses(disti_warm *warm)
+   known by disti_warm_drifts. Where it may be near 0 it is asked for, and looked at on both sides: without a silhouette
+   first at a quarter of them in turn (pass 0), then at those around which f has changed. */
+static void disti_warm_misses(disti_warm *warm, int pass)
 {
     for (int i = 0; i < warm->n; i++) {
+        int x = i % warm->tile->width, y = i / warm->tile->width;
+        if (!warm->silhouette && disti_warm_asks(warm, x, y) == pass) continue;
         size_t pixel = disti_warm_pixel(warm, i);
         disti_ray *ray = &warm->bench->rays[i];
         int blocked = ray->mode != DISTI_DONE, inside = warm->tape->status[pixel] & 15;
@@ -13067,7 +13069,14 @@ static void disti_warm_misses(disti_warm *warm)
         ray->best = warm->tape->s[pixel];
         ray->moved = 0;
         if (lower > 2e38f) continue;
-        if (blocked && (warm->due || lower < unsure + 3.0f * epsilon)) {
+        int near = blocked && (warm->due || lower < unsure + 3.0f * epsilon);
+        float spread = 3e38f, drift = 3e38f;
+        if (near && pass && !warm->silhouette) drift = disti_warm_between(warm, warm->drift, 0, i, &spread);
+        if (spread < 0.1f * f && drift < 0.1f * f && drift > -0.1f * f) { /* has not changed around, either */
+            lower = f + drift;
+            near = 0;
+        }
+        if (near) {
             disti_warm_list(warm, i, DISTI_ASK_LEAST, ray->best);
         } else {
             disti_ray_end(ray, DIST_RAY_MISS, ray->best, DISTI_MAX(lower, 0.0f), 0.0f);
@@ -13114,10 +13123,12 @@ static int disti_warm_least(disti_warm *warm, int i, float f)
     disti_ray *ray = &warm->bench->rays[i];
     float epsilon = disti_ray_epsilon(warm->tracer, ray, ray->best), radius = warm->tracer->field->radius;
     float margin = 5.0f * (warm->change + epsilon), value = warm->tape->value[disti_warm_pixel(warm, i)];
-    unsigned turn = (unsigned)(i + i / warm->tile->width) + warm->tape->turn;
-    int same = f > 0.9f * value && f < 1.1f * value && turn % 8u != 0; /* as where a plateau all but reaches 0 */
+    int x = i % warm->tile->width, y = i / warm->tile->width, turn = (int)(warm->tape->turn & 7u);
+    int first = disti_warm_asks(warm, x, y) && (x / 2 + y / 2 + turn / 4) & 1, odd = (i + y + turn) & 1;
+    int same = f > 0.9f * value && f < 1.1f * value && !first; /* as where a plateau all but reaches 0 */
     int still = !warm->silhouette && warm->change < 1e-3f * radius && value > 0.0f &&
-                (same || (turn % 2u && f > 3.0f * epsilon));
+                (same || (odd && f > 3.0f * epsilon));
+    if (!warm->silhouette && value > 0.0f) warm->drift[i] = f - value;
     if (!(warm->silhouette && value > 0.0f)) margin += 0.03f * radius; /* the bound is used up: a new one */
     ray->f = f;
     ray->s = ray->best;
@@ -13173,16 +13184,17 @@ static int disti_warm_near(disti_warm *warm, int i, float f)
     return 0;
 }
 
-/* Whether a hit that is marched anew has met nothing nearer (disti_warm_doubt) on its way to where it is expected: then
-   that is verified as it is for the others. */
+/* Whether a hit that is marched anew has met nothing nearer (disti_warm_doubt) on its way to where it is expected, and
+   f is what that alone makes it: then it is verified as the others are. */
 static int disti_warm_arrives(const disti_warm *warm, int i)
 {
     size_t pixel = disti_warm_pixel(warm, i);
     const disti_ray *ray = &warm->bench->rays[i];
-    float s = warm->tape->s[pixel];
+    float left = warm->tape->s[pixel] - ray->s, slope = warm->tape->value[pixel];
     if (warm->ask[i] != DISTI_ASK_REFRESH || warm->moved[i] < 2e38f) return 0;
     if ((warm->tape->status[pixel] & 15) != DIST_RAY_HIT || !disti_warm_falls(warm, pixel)) return 0;
-    return (ray->mode == DISTI_MARCH || ray->mode == DISTI_JUMP) && ray->s < s && ray->s > s - disti_warm_far(warm);
+    if (ray->mode != DISTI_MARCH && ray->mode != DISTI_JUMP) return 0;
+    return left > 0.0f && left < disti_warm_far(warm) && ray->f + warm->change >= -0.7f * slope * left;
 }
 
 static void disti_warm_drifted(disti_warm *warm, int i, float f)
@@ -13347,7 +13359,7 @@ static void disti_render_warm(const disti_render_job *job, int worker, const dis
     for (int i = 0; i < warm.n; i++) { /* those whose turn it is march beside all that follows */
         size_t pixel = disti_warm_pixel(&warm, i);
         int miss = (warm.tape->status[pixel] & 15) == DIST_RAY_MISS;
-        if (!warm.open[i] || !disti_warm_due(&warm, i, miss)) continue;
+        if (!warm.open[i] || !disti_warm_due(&warm, i, miss ? DISTI_WARM_MISSES : DISTI_WARM_HITS)) continue;
         if (miss || disti_warm_expects(&warm, i, warm.tape->s[pixel])) disti_warm_refresh(&warm, i, 3e38f);
     }
     before = warm.count;
@@ -13361,7 +13373,10 @@ static void disti_render_warm(const disti_render_job *job, int worker, const dis
         disti_warm_drifts(&warm, h);
         disti_warm_rounds(&warm, 0);
     }
-    if (good) disti_warm_misses(&warm);
+    for (int pass = warm.silhouette; pass < 2 && good; pass++) {
+        disti_warm_misses(&warm, pass);
+        if (!pass) disti_warm_rounds(&warm, 0);
+    }
     for (int i = 0; i < warm.n && good; i++) {
         if (disti_warm_listed(&warm, i)) { /* its turn comes with its end, if any */
             disti_warm_clear(&warm, i, 1);

@@ -667,7 +667,8 @@ typedef struct dist_tape dist_tape;
    betrays it, else by the rays that are marched anew in turn: a pixel after 512 renders at the latest (256 if it was a
    miss), after 128 (64) if f at the picture's hits changes by more than 0.0004 of the radius a render, on average. What
    such a ray finds is followed to its neighbors, within a tile at once where it is nearer by a hundredth of the radius,
-   else pixel by pixel. */
+   else pixel by pixel. Without a silhouette a miss that the surface nearly touches is looked at on both sides of that
+   place every second render, where f has hardly changed there every eighth: an outline may be so late. */
 DIST_API dist_tape *dist_tape_create(dist_context *ctx, const dist_camera *camera, const dist_render_desc *desc);
 DIST_API void dist_tape_destroy(dist_tape *tape);
 
@@ -12608,7 +12609,7 @@ typedef struct disti_warm {
     const disti_bench *bench;
     int worker, n, silhouette;
     float *moved;         /* of each pixel: how far its hit has moved; 3e38: not known */
-    float *drift;         /* of each miss, with a silhouette: how its least f has changed; 3e38: not known */
+    float *drift;         /* of each miss that was asked: how its least f has changed; 3e38: not known */
     unsigned char *open;  /* 1: not decided by the cones; 2: and its hit was not where it was looked for */
     unsigned char *ask;   /* DISTI_ASK_* */
     float change, mean;   /* largest change of f in the tile, no less than its mean over the picture */
@@ -12648,12 +12649,18 @@ static int disti_warm_reaches(const disti_warm *warm, int i)
     return ray->start + ray->guard / warm->tracer->lipschitz >= warm->tape->start[disti_warm_pixel(warm, i)];
 }
 
+/* A hit where f falls less steeply than this is not looked for. */
+static float disti_warm_flat(const disti_warm *warm)
+{
+    return -2e-4f * warm->tracer->lipschitz;
+}
+
 /* Whether f crossed 0 at the ray's last hit by falling, not all but flat, nor by a step, as where a solid that goes on
    beyond its bounding sphere is cut off: that does not move with what is around it. */
 static int disti_warm_falls(const disti_warm *warm, size_t pixel)
 {
-    float slope = warm->tape->value[pixel], lipschitz = warm->tracer->lipschitz;
-    return slope < -2e-4f * lipschitz && slope > -4.0f * lipschitz;
+    float slope = warm->tape->value[pixel];
+    return slope < disti_warm_flat(warm) && slope > -4.0f * warm->tracer->lipschitz;
 }
 
 /* Whether the ray may be looked for near its last hit s. */
@@ -12742,7 +12749,7 @@ static void disti_warm_hit(disti_warm *warm, int i, float s, float f, float erro
 static int disti_warm_newton(disti_warm *warm, int i, float f)
 {
     disti_ray *ray = &warm->bench->rays[i];
-    float far = 0.03f * warm->tracer->field->radius, flat = -2e-4f * warm->tracer->lipschitz;
+    float far = 0.03f * warm->tracer->field->radius, flat = disti_warm_flat(warm);
     float epsilon = disti_ray_epsilon(warm->tracer, ray, ray->q), at = ray->q, before = ray->a, other = ray->fa;
     int first = ray->steps++ == 0, steep;
     float slope = first ? ray->slope : (f - ray->fa) / (ray->q - ray->a), step = -f / slope;

@@ -1834,10 +1834,10 @@ typedef struct disti_kernels {
     int few_points; /* up to so many points `few` is the faster */
     const disti_part *parts; /* NULL: none; in ascending order up to one whose least is 0 */
     void (*bound)(const disti_bound *g);
-    /* top[o] = sum[0][o] + sum[4][o] + bias[o] + slack |bias[o]| + the largest of sum[1..3][o] . c + |sum[1..3][o]| . h
-       over DISTI_CELLS boxes (center c, half extents h) */
-    void (*top)(size_t out, const float *sum, size_t stride, const float *bias, float slack, const float *cell,
-                float *top);
+    /* live[o]: 0 where sum[0][o] + sum[4][o] + bias[o] + slack |bias[o]| + the largest of sum[1..3][o] . c
+       + |sum[1..3][o]| . h over DISTI_CELLS boxes (center c, half extents h) is below 0 and finite, else 1 */
+    void (*live)(size_t out, const float *sum, size_t stride, const float *bias, float slack, const float *cell,
+                 int *live);
     void (*fit)(const disti_fit *g);
     void (*gemm_back)(const disti_gemm_back *g);
     void (*gemm_weights)(const disti_gemm_weights *g);
@@ -2241,9 +2241,9 @@ static void disti_bound_scalar(const disti_bound *g)
     }
 }
 
-DISTI_INLINE void disti_top(size_t out, const float *DISTI_RESTRICT sum, size_t stride,
-                            const float *DISTI_RESTRICT bias, float slack, const float *DISTI_RESTRICT cell,
-                            float *DISTI_RESTRICT top)
+DISTI_INLINE void disti_live(size_t out, const float *DISTI_RESTRICT sum, size_t stride,
+                             const float *DISTI_RESTRICT bias, float slack, const float *DISTI_RESTRICT cell,
+                             int *DISTI_RESTRICT live)
 {
     const float *DISTI_RESTRICT x = sum + stride, *DISTI_RESTRICT y = x + stride, *DISTI_RESTRICT z = y + stride;
     const float *DISTI_RESTRICT e = z + stride;
@@ -2255,47 +2255,41 @@ DISTI_INLINE void disti_top(size_t out, const float *DISTI_RESTRICT sum, size_t 
                       w * cell[i + 5];
             most = t > most ? t : most;
         }
-        top[o] = most + sum[o] + bias[o] + e[o] + slack * fabsf(bias[o]);
+        most = most + sum[o] + bias[o] + e[o] + slack * fabsf(bias[o]);
+        live[o] = (int)!(most < 0.0f) | (int)!(most > -3e38f);
     }
 }
 
-DISTI_INLINE void disti_fit_rows(const disti_fit *g)
+DISTI_INLINE void disti_fit_slope(const disti_fit *g, size_t row, float *m)
 {
-    const float *DISTI_RESTRICT d = g->d;
-    const uint64_t full = ((uint64_t)1 << g->columns) - 1;
-    const size_t end = (size_t)g->columns;
+    const int full = g->mask[row] == ((uint64_t)1 << g->columns) - 1;
+    const float factor = 0.5f + 0.5f * (float)full, *s = g->sum + g->stride + row;
+    m[1] = factor * s[0];
+    m[2] = factor * s[g->stride];
+    m[3] = factor * s[2 * g->stride];
+}
+
+DISTI_INLINE void disti_fit_range(const disti_fit *g, float least, float most, float *m)
+{
+    const float middle = 0.5f * (least + most), range = DISTI_MAX(most - middle, middle - least);
+    const float reach = fabsf(m[1]) * g->half[0] + fabsf(m[2]) * g->half[1] + fabsf(m[3]) * g->half[2];
+    m[0] = middle;
+    m[4] = range + g->slack * (range + reach + fabsf(middle));
+}
+
+static void disti_fit_scalar(const disti_fit *g)
+{
     for (int i = 0; i < g->count; i++) {
         const size_t row = (size_t)g->list[i];
-        const float *DISTI_RESTRICT x = g->x + row * DISTI_BLOCK, factor = g->mask[row] == full ? 1.0f : 0.5f;
-        const float *s = g->sum + g->stride + row;
-        const float u = factor * s[0], v = factor * s[g->stride], w = factor * s[2 * g->stride];
-        float low[16], high[16], *m = g->model + (size_t)i * 8;
-        for (size_t c = 0; c < 16; c++) low[c] = 3e38f, high[c] = -3e38f;
-        for (size_t at = 0; at < end; at += 16) {
-            for (size_t c = 0; c < 16; c++) {
-                const float *p = d + at + c;
-                float r = x[at + c] - (u * p[0] + v * p[DISTI_BLOCK] + w * p[2 * DISTI_BLOCK]);
-                low[c] = r < low[c] ? r : low[c];
-                high[c] = r > high[c] ? r : high[c];
-            }
+        const float *x = g->x + row * DISTI_BLOCK, *p = g->d;
+        float *m = g->model + (size_t)i * 8, least = 3e38f, most = -3e38f;
+        disti_fit_slope(g, row, m);
+        for (int c = 0; c < g->columns; c++, p++) {
+            float r = x[c] - (m[1] * p[0] + m[2] * p[DISTI_BLOCK] + m[3] * p[2 * DISTI_BLOCK]);
+            least = r < least ? r : least;
+            most = r > most ? r : most;
         }
-        for (size_t c = 0; c < 8; c++) {
-            low[c] = low[c] < low[c + 8] ? low[c] : low[c + 8];
-            high[c] = high[c] > high[c + 8] ? high[c] : high[c + 8];
-        }
-        for (size_t c = 0; c < 4; c++) {
-            low[c] = low[c] < low[c + 4] ? low[c] : low[c + 4];
-            high[c] = high[c] > high[c + 4] ? high[c] : high[c + 4];
-        }
-        const float least = DISTI_MIN(DISTI_MIN(low[0], low[1]), DISTI_MIN(low[2], low[3]));
-        const float most = DISTI_MAX(DISTI_MAX(high[0], high[1]), DISTI_MAX(high[2], high[3]));
-        const float middle = 0.5f * (least + most), range = DISTI_MAX(most - middle, middle - least);
-        const float reach = fabsf(u) * g->half[0] + fabsf(v) * g->half[1] + fabsf(w) * g->half[2];
-        m[0] = middle;
-        m[1] = u;
-        m[2] = v;
-        m[3] = w;
-        m[4] = range + g->slack * (range + reach + fabsf(middle));
+        disti_fit_range(g, least, most, m);
     }
 }
 
@@ -2366,12 +2360,11 @@ DISTI_INLINE void disti_angles(double base, int levels, const float *DISTI_RESTR
     {                                                                                                                  \
         disti_axpy(n, s, x, y);                                                                                        \
     }                                                                                                                  \
-    function void disti_top_##isa(size_t out, const float *sum, size_t stride, const float *bias, float slack,         \
-                                   const float *cell, float *top)                                                      \
+    function void disti_live_##isa(size_t out, const float *sum, size_t stride, const float *bias, float slack,        \
+                                    const float *cell, int *live)                                                      \
     {                                                                                                                  \
-        disti_top(out, sum, stride, bias, slack, cell, top);                                                           \
-    }                                                                                                                  \
-    function void disti_fit_##isa(const disti_fit *g) { disti_fit_rows(g); }
+        disti_live(out, sum, stride, bias, slack, cell, live);                                                         \
+    }
 DISTI_PLAIN(scalar, static)
 
 #if defined(DISTI_X86) || defined(DISTI_NEON)
@@ -2850,6 +2843,31 @@ DISTI_PLAIN(scalar, static)
         }                                                                                                              \
     }
 
+/* disti_fit_scalar with -r beside r, so that only greatest lanes are sought. */
+#define DISTI_FIT(isa)                                                                                                 \
+    DISTI_NOINLINE DISTI_FUNCTION void disti_fit_##isa(const disti_fit *g)                                             \
+    {                                                                                                                  \
+        for (int i = 0; i < g->count; i++) {                                                                           \
+            const size_t row = (size_t)(unsigned)g->list[i];                                                           \
+            const float *x = g->x + row * DISTI_BLOCK, *p = g->d, *end = p + g->columns;                               \
+            float *m = g->model + (size_t)(unsigned)i * 8;                                                             \
+            DISTI_VEC low = DISTI_SET1(-3e38f), high = low;                                                           \
+            disti_fit_slope(g, row, m);                                                                                \
+            const DISTI_VEC u = DISTI_SET1(-m[1]), v = DISTI_SET1(-m[2]), w = DISTI_SET1(-m[3]);                       \
+            for (; p < end; p += DISTI_LANES, x += DISTI_LANES) {                                                      \
+                const DISTI_VEC p0 = DISTI_LOAD(p), p1 = DISTI_LOAD(p + DISTI_BLOCK);                                  \
+                const DISTI_VEC p2 = DISTI_LOAD(p + 2 * DISTI_BLOCK);                                                  \
+                DISTI_VEC r = DISTI_LOAD(x);                                                                           \
+                DISTI_FMA(r, u, p0);                                                                                   \
+                DISTI_FMA(r, v, p1);                                                                                   \
+                DISTI_FMA(r, w, p2);                                                                                   \
+                high = DISTI_GREATER(r, high);                                                                         \
+                low = DISTI_GREATER(DISTI_MINUS(r), low);                                                              \
+            }                                                                                                          \
+            disti_fit_range(g, -disti_most_##isa(low), disti_most_##isa(high), m);                                     \
+        }                                                                                                              \
+    }
+
 #define DISTI_KERNELS(isa, R, W)                                                                                       \
     DISTI_GEMM_TILE(wide_##isa, R, W, DISTI_SIDE)                                                                      \
     DISTI_GEMM_TILE(middle_##isa, R, 2, DISTI_SIDE)                                                                    \
@@ -2866,6 +2884,7 @@ DISTI_PLAIN(scalar, static)
     DISTI_WEIGHTS_TILE(narrow_##isa, 8, 1)                                                                             \
     DISTI_LAST_LAYER(isa)                                                                                              \
     DISTI_BOUND(isa)                                                                                                   \
+    DISTI_FIT(isa)                                                                                                     \
     DISTI_RELU_ROWS(isa)                                                                                               \
     DISTI_PLAIN(isa, DISTI_LOOPS DISTI_FUNCTION)                                                                       \
     DISTI_DRIVERS(isa, R, W)
@@ -2910,11 +2929,17 @@ DISTI_FUNCTION __m128 disti_keep_sse2(__m128 v, int bits)
 #define DISTI_DEPTH 112
 #define DISTI_GREATER(a, b) _mm_max_ps(a, b)
 #define DISTI_ABS(v) _mm_andnot_ps(_mm_set1_ps(-0.0f), v)
+#define DISTI_MINUS(v) _mm_xor_ps(_mm_set1_ps(-0.0f), v)
+#define DISTI_MOST4(q)                                                                                                 \
+    q = _mm_max_ps(q, _mm_movehl_ps(q, q));                                                                            \
+    return _mm_cvtss_f32(_mm_max_ss(q, _mm_shuffle_ps(q, q, 1)));
+DISTI_FUNCTION float disti_most_sse2(__m128 v) { DISTI_MOST4(v) }
 #define DISTI_TWO(p, q) ((void)(q), DISTI_LOAD(p))
 #define DISTI_TWO_STORE(p, q, v) (void)(q); DISTI_STORE(p, v);
 DISTI_KERNELS(sse2, 4, 2)
 DISTI_FEW_TILE(four_sse2, 4, 2)
 #undef DISTI_ABS
+#undef DISTI_MINUS
 #undef DISTI_GREATER
 #undef DISTI_FUNCTION
 #undef DISTI_VEC
@@ -2955,6 +2980,12 @@ DISTI_FUNCTION __m256 disti_keep_avx2(__m256 v, int bits)
 #define DISTI_DEPTH 112
 #define DISTI_GREATER(a, b) _mm256_max_ps(a, b)
 #define DISTI_ABS(v) _mm256_andnot_ps(_mm256_set1_ps(-0.0f), v)
+#define DISTI_MINUS(v) _mm256_xor_ps(_mm256_set1_ps(-0.0f), v)
+DISTI_FUNCTION float disti_most_avx2(__m256 v)
+{
+    __m128 q = _mm_max_ps(_mm256_castps256_ps128(v), _mm256_extractf128_ps(v, 1));
+    DISTI_MOST4(q)
+}
 DISTI_KERNELS(avx2, 4, 3)
 DISTI_FEW_TILE(two_avx2, 2, 4)
 DISTI_FEW_TILE(four_avx2, 4, 2)
@@ -2969,6 +3000,7 @@ static void disti_few_avx2(const disti_few *g)
 }
 static const disti_part disti_parts_avx2[] = {{9, 18, 6}, {25, 30, 24}, {33, 40, 24}, {0, 0, 0}};
 #undef DISTI_ABS
+#undef DISTI_MINUS
 #undef DISTI_GREATER
 #undef DISTI_TWO
 #undef DISTI_TWO_STORE
@@ -3020,6 +3052,14 @@ DISTI_GEMM_TILE(tall_avx512, 16, 1, DISTI_ABOVE)
 DISTI_BACK_TILE(few_avx512, 4, 3, DISTI_LISTED)
 #define DISTI_GREATER(a, b) _mm512_maskz_max_ps((__mmask16)0xffff, a, b)
 #define DISTI_ABS(v) _mm512_andnot_ps(_mm512_set1_ps(-0.0f), v)
+#define DISTI_MINUS(v) _mm512_xor_ps(_mm512_set1_ps(-0.0f), v)
+DISTI_FUNCTION float disti_most_avx512(__m512 v)
+{
+    const __m256 high = _mm512_maskz_extractf32x8_ps((__mmask8)0xff, v, 1);
+    const __m256 half = _mm256_max_ps(_mm512_castps512_ps256(v), high);
+    __m128 q = _mm_max_ps(_mm256_castps256_ps128(half), _mm256_extractf128_ps(half, 1));
+    DISTI_MOST4(q)
+}
 #define DISTI_TWO(p, q) \
     _mm512_maskz_insertf32x8((__mmask16)0xffff, _mm512_castps256_ps512(_mm256_loadu_ps(p)), _mm256_loadu_ps(q), 1)
 #define DISTI_TWO_STORE(p, q, v) \
@@ -3044,6 +3084,7 @@ static void disti_few_avx512(const disti_few *g)
 static const disti_part disti_parts_avx512[] = {{13, 24, 12}, {33, 44, 32}, {49, 56, 32},
                                                 {57, 60, 48}, {61, 1 << 30, 32}, {0, 0, 0}};
 #undef DISTI_ABS
+#undef DISTI_MINUS
 #undef DISTI_GREATER
 #undef DISTI_TWO
 #undef DISTI_TWO_STORE
@@ -3336,11 +3377,14 @@ static float32x4_t disti_keep_neon(float32x4_t v, uint32_t bits)
 #define DISTI_DEPTH 112
 #define DISTI_GREATER(a, b) vmaxq_f32(a, b)
 #define DISTI_ABS(v) vabsq_f32(v)
+#define DISTI_MINUS(v) vnegq_f32(v)
+static float disti_most_neon(float32x4_t v) { return vmaxvq_f32(v); }
 #define DISTI_TWO(p, q) ((void)(q), DISTI_LOAD(p))
 #define DISTI_TWO_STORE(p, q, v) (void)(q); DISTI_STORE(p, v);
 DISTI_KERNELS(neon, 8, 3)
 DISTI_FEW_TILE(four_neon, 4, 2)
 #undef DISTI_ABS
+#undef DISTI_MINUS
 #undef DISTI_GREATER
 #undef DISTI_TWO
 #undef DISTI_TWO_STORE
@@ -3375,7 +3419,7 @@ static uint32_t disti_f16_bits(float x) /* not called: dist_net_set_half refuses
     kernels.activate = disti_activate_##isa; \
     kernels.gemm_some = disti_gemm_some_##isa; \
     kernels.bound = disti_bound_##isa; \
-    kernels.top = disti_top_##isa; \
+    kernels.live = disti_live_##isa; \
     kernels.fit = disti_fit_##isa; \
     kernels.norm = disti_norm_##isa; \
     kernels.norm_back = disti_norm_back_##isa;
@@ -3485,6 +3529,8 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_BOUND1
 #undef DISTI_BOUND_ZERO
 #undef DISTI_BOUND_STORE
+#undef DISTI_FIT
+#undef DISTI_MOST4
 #undef DISTI_PREFETCH
 #undef DISTI_FUNCTION
 #undef DISTI_VEC
@@ -6678,7 +6724,7 @@ typedef struct disti_group {
     float *point, *away; /* (GROUP, 3, B): the points, and from their block's center */
     float *model;    /* (GROUP, max_rows, 8): of those rows, see disti_fit */
     float *sum;      /* (GROUP, 5, max_rows): of each output, see disti_bound */
-    float *top;      /* max_rows: of each output the bound */
+    int *live;       /* max_rows: of each output, see disti_kernels */
     int *unit;       /* max_rows: those that are computed */
     uint64_t *mask;  /* (GROUP, layers, max_rows): as disti_block has them */
     int *alive;      /* (GROUP, layers, max_rows) */
@@ -6705,7 +6751,7 @@ static size_t disti_group_layout(const dist_net *net, unsigned char *base, const
     g->away = (float *)disti_take(base, &at, DISTI_GROUP * 3, row);
     g->model = (float *)disti_take(base, &at, DISTI_GROUP * rows * 8, sizeof(float));
     g->sum = (float *)disti_take(base, &at, DISTI_GROUP * rows * 5, sizeof(float));
-    g->top = (float *)disti_take(base, &at, rows, sizeof(float));
+    g->live = (int *)disti_take(base, &at, rows, sizeof(int));
     g->unit = (int *)disti_take(base, &at, rows, sizeof(int));
     g->mask = (uint64_t *)disti_take(base, &at, DISTI_GROUP * all, sizeof(uint64_t));
     g->alive = (int *)disti_take(base, &at, DISTI_GROUP * all, sizeof(int));
@@ -6826,13 +6872,13 @@ static double disti_group_forward(const dist_shape *shape, const disti_kernels *
         kernels->bound(&bound);
         for (int j = 0; j < g->blocks; j++) {
             size_t block = (size_t)j * width, at = (size_t)j * all + (size_t)l * width;
-            const float *top = g->top;
+            const int *live = g->live;
             int units = 0, out = layer->out, *unit = g->unit;
             disti_gemm m;
-            kernels->top((size_t)out, g->sum + 5 * block, width, bias, slack, g->cell[j], g->top);
-            for (int o = 0; o < out; o++) { /* what is not finite comes out as without */
+            kernels->live((size_t)out, g->sum + 5 * block, width, bias, slack, g->cell[j], g->live);
+            for (int o = 0; o < out; o++) {
                 unit[units] = o;
-                units += (int)!(top[o] < 0.0f) | (int)!(top[o] > -3e38f);
+                units += live[o];
             }
             m.weights = bound.weights;
             m.bias = bias;

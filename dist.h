@@ -1968,9 +1968,8 @@ static void disti_lanes_scalar(const float *s, const float *x, const int *alive,
 /* exp to 2 ulp, x in [-87, 88] */
 DISTI_INLINE float disti_exp_within(float x)
 {
-    float n = x * 1.44269504f;
-    int32_t k = (int32_t)(n < 0.0f ? n - 0.5f : n + 0.5f);
-    n = (float)k;
+    int32_t k = (int32_t)(x * 1.44269504f + 127.5f); /* 127 + what is rounded, which makes it positive */
+    float n = (float)(k - 127);
     float r = x - n * 0.693359375f;
     r += n * 2.12194440e-4f;
     float p = 1.9875691500e-4f;
@@ -1980,54 +1979,60 @@ DISTI_INLINE float disti_exp_within(float x)
     p = p * r + 1.6666665459e-1f;
     p = p * r + 5.0000001201e-1f;
     p = p * r * r + r + 1.0f;
-    uint32_t bits = (uint32_t)(k + 127) << 23;
+    uint32_t bits = (uint32_t)k << 23;
     float scale;
     memcpy(&scale, &bits, sizeof scale);
     return p * scale;
 }
 
-/* exp; below -87 it is 0, above 88 the largest float. */
+/* exp(x), as if x were no less than -87 and no more than 88. */
 DISTI_INLINE float disti_exp(float x)
 {
     x = x < 88.0f ? x : 88.0f; /* also for NaN, which may stand in idle lanes */
     return disti_exp_within(x > -87.0f ? x : -87.0f);
 }
 
-DISTI_INLINE float disti_tanh(float x)
+/* exp(-|x|), no less than 1.6e-38, which it is for NaN, too */
+DISTI_INLINE float disti_exp_falling(float x)
 {
     float a = x < 0.0f ? -x : x;
-    float s = x * x;
+    return disti_exp_within(a < 87.0f ? -a : -87.0f);
+}
+
+DISTI_INLINE float disti_tanh(float x)
+{
+    float s = x * x, e = disti_exp_falling(2.0f * x);
     float small = x + x * s * ((((-5.70498872745e-3f * s + 2.06390887954e-2f) * s - 5.37397155531e-2f) * s +
                                 1.33314422036e-1f) * s - 3.33332819422e-1f);
-    float large = 1.0f - 2.0f / (disti_exp_within(2.0f * (a < 20.0f ? a : 20.0f)) + 1.0f);
+    float large = (1.0f - e) * (1.0f / (1.0f + e));
     large = x < 0.0f ? -large : large;
-    return a < 0.625f ? small : large;
+    return s < 0.390625f ? small : large;
 }
 
 DISTI_INLINE float disti_sigmoid(float x)
 {
-    float e = disti_exp(x < 0.0f ? x : -x);
-    return (x < 0.0f ? e : 1.0f) / (1.0f + e);
+    float e = disti_exp_falling(x);
+    return (x < 0.0f ? e : 1.0f) * (1.0f / (1.0f + e));
 }
 
 /* Their derivatives, by e = exp(-2 |x|) and exp(-|x|): relatively exact where 1 - tanh^2 would have cancelled to
    nothing. */
 DISTI_INLINE float disti_tanh_slope(float x)
 {
-    float e = disti_exp(x < 0.0f ? 2.0f * x : -2.0f * x);
-    return 4.0f * e / ((1.0f + e) * (1.0f + e));
+    float e = disti_exp_falling(2.0f * x), inverse = 1.0f / (1.0f + e);
+    return 4.0f * e * inverse * inverse;
 }
 
 DISTI_INLINE float disti_sigmoid_slope(float x)
 {
-    float e = disti_exp(x < 0.0f ? x : -x);
-    return e / ((1.0f + e) * (1.0f + e));
+    float e = disti_exp_falling(x), inverse = 1.0f / (1.0f + e);
+    return e * inverse * inverse;
 }
 
-/* log(1 + exp(-a)), a >= 0: the smooth part of softplus, by 2 atanh(u / (2 + u)). */
-DISTI_INLINE float disti_log1p_exp(float a)
+/* log(1 + exp(-|x|)), the smooth part of softplus, by 2 atanh(u / (2 + u)). */
+DISTI_INLINE float disti_log1p_exp(float x)
 {
-    float u = disti_exp(-a);
+    float u = disti_exp_falling(x);
     float s = u / (2.0f + u);
     float q = s * s;
     return 2.0f * s *
@@ -2057,6 +2062,34 @@ DISTI_INLINE void disti_sincos(double x, double *sine, double *cosine)
     *cosine = ((k + 1) & 2) ? -b : b;
 }
 
+/* sin(r), |r| <= pi / 2, to 3 ulp and within [-1, 1]: at the ends it is meant 4.5e-8 too small for that. */
+DISTI_INLINE float disti_sine_half(float r)
+{
+    float s = r * r;
+    return r + r * s * (((2.6055735e-6f * s - 1.98098008e-4f) * s + 8.33306785e-3f) * s - 1.66666596e-1f);
+}
+
+/* (-1)^k v */
+DISTI_INLINE float disti_flip(float v, int32_t k)
+{
+    uint32_t bits;
+    memcpy(&bits, &v, sizeof bits);
+    bits ^= (uint32_t)k << 31;
+    memcpy(&v, &bits, sizeof v);
+    return v;
+}
+
+/* sin(a) and cos(a) by a = k pi + r: (-1)^k sin(r) and (-1)^k sin(pi / 2 - |r|), with both differences taken in double,
+   so that they keep their digits. |a| <= 1e9; 2^29 makes what is rounded positive. */
+DISTI_INLINE float disti_sine(double a, float *cosine)
+{
+    int32_t k = (int32_t)(a * 0.318309886183790671538 + 536870912.5);
+    double r = a - (double)(k - 536870912) * 3.14159265346825122834;
+    r -= (double)(k - 536870912) * 1.21542010130123844498e-10;
+    *cosine = disti_flip(disti_sine_half((float)(1.57079632679489661923 - fabs(r))), k);
+    return disti_flip(disti_sine_half((float)r), k);
+}
+
 /* activation(x), *slope gets its derivative. scale: softplus's beta, sine's omega. */
 DISTI_INLINE float disti_activate_one(int activation, float scale, float x, float *slope)
 {
@@ -2068,23 +2101,21 @@ DISTI_INLINE float disti_activate_one(int activation, float scale, float x, floa
         break;
     case DIST_ACTIVATION_ELU: {
         float near_zero = x * (1.0f + x * (0.5f + x * (1.0f / 6 + x * (1.0f / 24 + x * (1.0f / 120)))));
-        float below = disti_exp(x) - 1.0f;
-        below = x > -0.1f ? near_zero : below;
+        float e = disti_exp(x), below = x > -0.1f ? near_zero : e - 1.0f;
         v = x > 0.0f ? x : below;
-        d = x > 0.0f ? 1.0f : below + 1.0f;
+        d = x > 0.0f ? 1.0f : e;
         break;
     }
     case DIST_ACTIVATION_SOFTPLUS: {
         float a = scale * x;
-        v = (x > 0.0f ? x : 0.0f) + disti_log1p_exp(a < 0.0f ? -a : a) / scale;
+        v = (x > 0.0f ? x : 0.0f) + disti_log1p_exp(a) * (1.0f / scale);
         d = disti_sigmoid(a);
         break;
     }
     case DIST_ACTIVATION_SINE: {
-        double s, c;
-        disti_sincos((double)scale * (double)x, &s, &c);
-        v = (float)s;
-        d = (float)((double)scale * c);
+        float most = 1e9f / scale, within = x < most ? x : 0.0f; /* also for NaN */
+        v = disti_sine((double)scale * (double)(within > -most ? within : 0.0f), &d);
+        d *= scale;
         break;
     }
     case DIST_ACTIVATION_TANH:
@@ -2175,7 +2206,8 @@ DISTI_INLINE void disti_norm_backward(int units, const float *gamma, size_t half
 {
     float along[DISTI_BLOCK], cross[DISTI_BLOCK];
     size_t count = (size_t)units * DISTI_BLOCK;
-    for (size_t u = 0; u < count; u++) d[u] *= gamma[u / DISTI_BLOCK];
+    for (size_t u = 0; u < count; u += DISTI_BLOCK, gamma++)
+        for (size_t c = 0; c < DISTI_BLOCK; c++) d[u + c] *= *gamma;
     if (!half) { /* by a constant, for the loops' sake */
         disti_norm_project(units, DISTI_BLOCK, hat, inverse, d, along);
         return;
@@ -3055,8 +3087,8 @@ DISTI_BACK_TILE(few_avx512, 4, 3, DISTI_LISTED)
 #define DISTI_MINUS(v) _mm512_xor_ps(_mm512_set1_ps(-0.0f), v)
 DISTI_FUNCTION float disti_most_avx512(__m512 v)
 {
-    const __m256 high = _mm512_maskz_extractf32x8_ps((__mmask8)0xff, v, 1);
-    const __m256 half = _mm256_max_ps(_mm512_castps512_ps256(v), high);
+    const __m256 half = _mm256_max_ps(_mm512_maskz_extractf32x8_ps((__mmask8)0xff, v, 0),
+                                      _mm512_maskz_extractf32x8_ps((__mmask8)0xff, v, 1));
     __m128 q = _mm_max_ps(_mm256_castps256_ps128(half), _mm256_extractf128_ps(half, 1));
     DISTI_MOST4(q)
 }

@@ -423,6 +423,100 @@ static void check_plain_case(const disti_kernels *kernels, test_random *random, 
     release(beta, rows);
 }
 
+/* What bounds of units are made of: the models of rows, their sums for every output, and which units may be alive. */
+static void check_bounds_case(const disti_kernels *kernels, test_random *random, test_size size)
+{
+    enum { BLOCKS = 2 };
+    const int padded = rounded(size.out), columns = (size.columns + 15) / 16 * 16;
+    const size_t stride = (size_t)(size.rows > padded ? size.rows : padded), sums = BLOCKS * 5 * stride;
+    int list[BLOCKS * TEST_LONGEST], count[BLOCKS], live[TEST_LONGEST];
+    float *weights = panels(random, size.rows, size.out), *bias = floats(stride), *slopes = floats(5 * stride);
+    float *model = floats(BLOCKS * stride * 8), *sum = floats(sums), *d = floats(3 * TEST_BLOCK), *x[BLOCKS];
+    uint64_t mask[TEST_LONGEST];
+    disti_fit fit;
+    test_random_fill(random, stride, bias, -1.0f, 1.0f);
+    test_random_fill(random, 5 * stride, slopes, -1.0f, 1.0f);
+    for (size_t k = 0; k < 3; k++) test_random_fill(random, (size_t)columns, d + k * TEST_BLOCK, -0.5f, 0.5f);
+    for (int k = 0; k < size.rows; k++) mask[k] = (k % 3 ? ((uint64_t)1 << columns) : (uint64_t)2) - 1;
+    fit.d = d;
+    fit.sum = slopes;
+    fit.mask = mask;
+    fit.stride = stride;
+    fit.half[0] = fit.half[1] = fit.half[2] = 0.5f;
+    fit.slack = 1e-5f;
+    fit.columns = columns;
+    for (int b = 0; b < BLOCKS; b++) {
+        count[b] = random_list(random, size.rows, list + b * TEST_LONGEST);
+        x[b] = block(random, size.rows, columns, list + b * TEST_LONGEST, count[b]);
+        fit.list = list + b * TEST_LONGEST;
+        fit.x = x[b];
+        fit.model = model + (size_t)b * stride * 8;
+        fit.count = count[b];
+        kernels->fit(&fit);
+        for (int i = 0; i < count[b]; i++) {
+            const int row = fit.list[i];
+            const float *m = fit.model + 8 * i;
+            double least = 1e9, most = -1e9;
+            const float factor = row % 3 ? 1.0f : 0.5f; /* as the mask has it */
+            for (int k = 1; k < 4; k++)
+                CHECK_NEAR((double)(factor * slopes[(size_t)k * stride + (size_t)row]), m[k], 0);
+            for (int c = 0; c < columns; c++) {
+                double r = (double)x[b][row * TEST_BLOCK + c] - (double)m[0];
+                for (int k = 0; k < 3; k++) r -= (double)m[1 + k] * (double)d[k * TEST_BLOCK + c];
+                least = fmin(least, r);
+                most = fmax(most, r);
+            }
+            CHECK(fmax(most, -least) <= (double)m[4]);
+            CHECK((double)m[4] <= 0.5 * (most - least) + 1e-4);
+        }
+    }
+    disti_bound g;
+    g.weights = weights;
+    g.list = list;
+    g.count = count;
+    g.model = model;
+    g.sum = sum;
+    g.stride = stride;
+    g.list_stride = TEST_LONGEST;
+    g.rows = size.rows;
+    g.out = size.out;
+    g.blocks = BLOCKS;
+    kernels->bound(&g);
+    float cell[6 * DISTI_CELLS];
+    test_random_fill(random, 6 * DISTI_CELLS, cell, 0.0f, 0.5f);
+    for (int b = 0; b < BLOCKS; b++) {
+        const float *got = sum + (size_t)b * 5 * stride;
+        kernels->live((size_t)size.out, got, stride, bias, fit.slack, cell, live);
+        for (int o = 0; o < size.out; o++) {
+            double exact[5] = {0, 0, 0, 0, 0}, size_sum[5] = {0, 0, 0, 0, 0}, most = -1e9;
+            for (int i = 0; i < count[b]; i++) {
+                const float *m = model + ((size_t)b * stride + (size_t)i) * 8;
+                double w = (double)weights[packed(size.rows, o, list[b * TEST_LONGEST + i])];
+                for (int k = 0; k < 5; k++) exact[k] += (k < 4 ? w : fabs(w)) * (double)m[k];
+                for (int k = 0; k < 5; k++) size_sum[k] += fabs(w * (double)m[k]);
+            }
+            for (int k = 0; k < 5; k++)
+                CHECK_NEAR(exact[k], got[(size_t)k * stride + (size_t)o], bound(count[b], size_sum[k]));
+            for (int i = 0; i < 6 * DISTI_CELLS; i += 6) {
+                double t = 0;
+                for (int k = 0; k < 3; k++)
+                    t += exact[1 + k] * (double)cell[i + k] + fabs(exact[1 + k]) * (double)cell[i + 3 + k];
+                most = fmax(most, t);
+            }
+            most += exact[0] + exact[4] + (double)bias[o];
+            if (fabs(most) > 2e-5 + bound(count[b], 8 * (size_sum[0] + size_sum[1] + size_sum[2] + size_sum[3])))
+                CHECK_EQUAL(most > 0, live[o]);
+        }
+    }
+    release(weights, (size_t)padded * (size_t)size.rows);
+    release(bias, stride);
+    release(slopes, 5 * stride);
+    release(model, BLOCKS * stride * 8);
+    release(sum, sums);
+    release(d, 3 * TEST_BLOCK);
+    for (int b = 0; b < BLOCKS; b++) release(x[b], (size_t)size.rows * TEST_BLOCK);
+}
+
 typedef struct test_result {
     float y[72 * TEST_BLOCK];
     float dot[TEST_BLOCK];
@@ -487,7 +581,7 @@ static void check_same_bits(const disti_kernels *kernels, test_random *random, t
     release(y, (size_t)padded * TEST_BLOCK);
 }
 
-enum { GEMM, BACK, WEIGHTS, DOT, OUTER, LANES, PLAIN, ZERO_ROWS, FEWER_COLUMNS };
+enum { GEMM, BACK, WEIGHTS, DOT, OUTER, LANES, PLAIN, BOUNDS, ZERO_ROWS, FEWER_COLUMNS };
 
 static void check_all_sizes(int isa, int what)
 {
@@ -506,6 +600,7 @@ static void check_all_sizes(int isa, int what)
             if (what == LANES && variant < 2) check_lanes_case(&kernels, &random, size, variant);
             if (what == LANES && variant == 2) check_points_case(&kernels, &random, size);
             if (what == PLAIN && variant == 0 && n % 7 == 0) check_plain_case(&kernels, &random, size);
+            if (what == BOUNDS && variant == 0) check_bounds_case(&kernels, &random, size);
             if (size.out > 70) continue;
             if (what == ZERO_ROWS && variant < 2) check_same_bits(&kernels, &random, size, 1, variant);
             if (what == FEWER_COLUMNS && variant < 2) check_same_bits(&kernels, &random, size, 0, variant);
@@ -524,6 +619,7 @@ static void check_all_sizes(int isa, int what)
     TEST(outer_of_##name##_is_its_formula_and_writes_listed_rows_only) { check_all_sizes(isa, OUTER); }     \
     TEST(sums_over_lanes_and_points_of_##name##_are_their_formulas) { check_all_sizes(isa, LANES); }        \
     TEST(element_by_element_##name##_does_what_scalar_does) { check_all_sizes(isa, PLAIN); }                \
+    TEST(bounds_of_units_of_##name##_hold) { check_all_sizes(isa, BOUNDS); }                                \
     TEST(leaving_out_zero_rows_changes_no_bit_with_##name) { check_all_sizes(isa, ZERO_ROWS); }             \
     TEST(a_column_does_not_depend_on_their_number_with_##name) { check_all_sizes(isa, FEWER_COLUMNS); }
 
@@ -535,6 +631,7 @@ static void check_all_sizes(int isa, int what)
     RUN(outer_of_##name##_is_its_formula_and_writes_listed_rows_only); \
     RUN(sums_over_lanes_and_points_of_##name##_are_their_formulas);  \
     RUN(element_by_element_##name##_does_what_scalar_does);          \
+    RUN(bounds_of_units_of_##name##_hold);                           \
     RUN(leaving_out_zero_rows_changes_no_bit_with_##name);           \
     RUN(a_column_does_not_depend_on_their_number_with_##name)
 

@@ -847,6 +847,15 @@ TEST(row_21_sine_networks)
             worst = fmax(worst, fabs((double)slope - exact) / ulp);
         }
         SAY(worst <= 4, "own sine and its slope, angles to 20 omega: ulp", "at most 4", worst);
+        worst = 0;
+        for (int j = -20000; j < 20000; j++) { /* where sine or slope is largest, and far out */
+            float x = (float)(1.57079632679489661923 * (double)j / omegas[k]), slope = 0;
+            for (int far = 0; far < 2; far++, x *= 1e4f) {
+                double v = (double)disti_activate_one(DIST_ACTIVATION_SINE, (float)omegas[k], x, &slope);
+                worst = fmax(worst, fmax(fabs(v), fabs((double)slope) / omegas[k]));
+            }
+        }
+        SAY(worst <= 1, "largest |sine| and |slope| / omega", "1", worst);
         dist_shape_destroy(shape);
         dist_net_destroy(net);
         model_free(&m);

@@ -1861,9 +1861,17 @@ typedef struct disti_kernels {
     void (*relu)(size_t rows, float *y, uint64_t *mask);
     /* y <- activation(y), n values; slope (n) gets its derivative unless NULL */
     void (*activate)(int activation, float scale, size_t n, float *y, float *slope);
+    /* its adjoint of n rows, in place: disti_activate_backward */
+    void (*activate_back)(size_t n, size_t half, const float *slope, float *d);
     /* LayerNorm of a block: disti_norm_lanes over all lanes */
     void (*norm)(int units, float epsilon, const float *gamma, const float *beta, float *x, float *hat, float *inverse);
     void (*norm_back)(int units, const float *gamma, size_t half, const float *hat, const float *inverse, float *d);
+    /* of values in the first half of the lanes and tangents in the second: disti_norm_tangent_lanes, and of n rows
+       disti_activate_tangents */
+    void (*norm_tangents)(int units, float epsilon, const float *gamma, const float *beta, float *x, float *hat,
+                          float *inverse);
+    void (*activate_tangents)(int activation, float scale, size_t n, float *y, float *slope, uint64_t *mask);
+    int (*huge)(size_t n, const float *x); /* whether disti_is_huge of any */
 } disti_kernels;
 
 /* The scalar kernels are the definition; the others are measured against them. */
@@ -2151,6 +2159,68 @@ DISTI_INLINE void disti_activate(int activation, float scale, size_t n, float *y
     }
 }
 
+/* backward  d_x = phi'(x) d_y
+   tangents  of y' = phi'(x) x' in the lanes from `half` on, where that is not 0:  d_x = phi' d_y + phi''(x) x' d_y',
+             d_x' = phi' d_y', and their slopes are phi'' x' (disti_hidden)
+   n rows, in place: d is d_y, then d_x */
+DISTI_INLINE void disti_activate_backward(size_t n, size_t half, const float *DISTI_RESTRICT slope,
+                                          float *DISTI_RESTRICT d)
+{
+    if (!half) {
+        for (size_t i = 0; i < n * DISTI_BLOCK; i++) d[i] *= slope[i];
+        return;
+    }
+    for (size_t u = 0; u < n; u++, slope += DISTI_BLOCK, d += DISTI_BLOCK) {
+        for (size_t c = 0; c < half; c++) d[c] = slope[c] * d[c] + slope[c + half] * d[c + half];
+        for (size_t c = 0; c < half; c++) d[c + half] *= slope[c];
+    }
+}
+
+/* phi'' of a value v = phi(x) whose slope phi'(x) is d. */
+DISTI_INLINE float disti_curvature(int activation, float scale, float v, float d)
+{
+    switch (activation) {
+    case DIST_ACTIVATION_ELU: return v > 0.0f ? 0.0f : d;
+    case DIST_ACTIVATION_SOFTPLUS: return scale * d * (1.0f - d);
+    case DIST_ACTIVATION_SINE: return -scale * scale * v;
+    case DIST_ACTIVATION_TANH: return -2.0f * v * d;
+    }
+    return 0.0f;
+}
+
+DISTI_INLINE void disti_tangents_loop(int activation, float scale, size_t n, float *DISTI_RESTRICT y,
+                                      float *DISTI_RESTRICT slope, uint64_t *mask)
+{
+    enum { HALF = DISTI_BLOCK / 2 };
+    float own[DISTI_BLOCK];
+    for (size_t u = 0; u < n; u++) {
+        float *DISTI_RESTRICT v = y + u * DISTI_BLOCK, *DISTI_RESTRICT d = slope ? slope + u * DISTI_BLOCK : own;
+        uint32_t alive = 0;
+        for (size_t c = 0; c < HALF; c++) v[c] = disti_activate_one(activation, scale, v[c], d + c);
+        for (size_t c = 0; c < HALF; c++) {
+            d[HALF + c] = disti_curvature(activation, scale, v[c], d[c]) * v[HALF + c];
+            v[HALF + c] *= d[c];
+        }
+        if (activation != DIST_ACTIVATION_RELU) continue;
+        for (size_t c = 0; c < HALF; c++) alive |= (uint32_t)(d[c] > 0.0f) << c;
+        mask[u] = (uint64_t)alive << HALF | alive; /* a value and its tangent are alive together */
+    }
+}
+
+/* n rows of values x and tangents x': y = phi(x), y' = phi'(x) x'; slope, unless NULL, gets phi' and phi'' x', and
+   ReLU's mask which lanes are alive. */
+DISTI_INLINE void disti_activate_tangents(int activation, float scale, size_t n, float *y, float *slope, uint64_t *mask)
+{
+    switch (activation) {
+    case DIST_ACTIVATION_RELU: disti_tangents_loop(DIST_ACTIVATION_RELU, scale, n, y, slope, mask); break;
+    case DIST_ACTIVATION_ELU: disti_tangents_loop(DIST_ACTIVATION_ELU, scale, n, y, slope, mask); break;
+    case DIST_ACTIVATION_SOFTPLUS: disti_tangents_loop(DIST_ACTIVATION_SOFTPLUS, scale, n, y, slope, mask); break;
+    case DIST_ACTIVATION_SINE: disti_tangents_loop(DIST_ACTIVATION_SINE, scale, n, y, slope, mask); break;
+    case DIST_ACTIVATION_TANH: disti_tangents_loop(DIST_ACTIVATION_TANH, scale, n, y, slope, mask); break;
+    case DIST_ACTIVATION_NONE: disti_tangents_loop(DIST_ACTIVATION_NONE, scale, n, y, slope, mask); break;
+    }
+}
+
 /* forward   mu = mean_u x, v = mean_u (x - mu)^2, hat = (x - mu) / sqrt(v + eps), y = gamma hat + beta, for each of the
    first `lanes` lanes */
 DISTI_INLINE void disti_norm_lanes(int units, size_t lanes, float epsilon, const float *gamma, const float *beta,
@@ -2198,6 +2268,23 @@ DISTI_INLINE void disti_norm_project(int units, size_t lanes, const float *DISTI
         for (size_t c = 0; c < lanes; c++) d[u + c] = (d[u + c] - mean[c] - hat[u + c] * along[c]) * inverse[c];
 }
 
+/* disti_norm_lanes of the values in the first half of the lanes, then their tangents in the others:
+   hat' = P x' / sqrt(v + eps),  y' = gamma hat'; the inverse's place gets mean_u (hat x') */
+DISTI_INLINE void disti_norm_tangent_lanes(int units, float epsilon, const float *gamma, const float *beta,
+                                           float *DISTI_RESTRICT x, float *DISTI_RESTRICT hat,
+                                           float *DISTI_RESTRICT inverse)
+{
+    enum { HALF = DISTI_BLOCK / 2 };
+    disti_norm_lanes(units, HALF, epsilon, gamma, beta, x, hat, inverse);
+    disti_norm_project(units, HALF, hat, inverse, x + HALF, inverse + HALF);
+    x += HALF;
+    hat += HALF;
+    for (int u = 0; u < units; u++, x += DISTI_BLOCK, hat += DISTI_BLOCK, gamma++) {
+        for (size_t c = 0; c < HALF; c++) hat[c] = x[c];
+        for (size_t c = 0; c < HALF; c++) x[c] *= *gamma;
+    }
+}
+
 /* backward  d_x = P gamma d_y / sigma     in place: d is d_y, then d_x
    tangents  d_x' = P gamma d_y' / sigma, and from hat' to x, with g' = gamma d_y':
              d_x -= (hat mean_u (g' hat') + hat' mean_u (g' hat) + d_x' mean_u (hat x')) / sigma */
@@ -2212,6 +2299,7 @@ DISTI_INLINE void disti_norm_backward(int units, const float *gamma, size_t half
         disti_norm_project(units, DISTI_BLOCK, hat, inverse, d, along);
         return;
     }
+    half = DISTI_BLOCK / 2;
     disti_norm_project(units, half, hat, inverse, d, along);
     memset(cross, 0, sizeof cross);
     for (size_t u = half; u < count; u += DISTI_BLOCK)
@@ -2325,6 +2413,18 @@ static void disti_fit_scalar(const disti_fit *g)
     }
 }
 
+DISTI_INLINE int disti_huge_any(size_t n, const float *x)
+{
+    int32_t most = 0;
+    for (size_t i = 0; i < n; i++) {
+        int32_t bits;
+        memcpy(&bits, x + i, sizeof bits);
+        bits &= 0x7fffffff;
+        most = bits > most ? bits : most;
+    }
+    return most >= 0x5b800000;
+}
+
 DISTI_INLINE void disti_axpy(size_t n, double s, const float *DISTI_RESTRICT x, double *DISTI_RESTRICT y)
 {
     for (size_t i = 0; i < n; i++) y[i] += s * (double)x[i];
@@ -2376,6 +2476,21 @@ DISTI_INLINE void disti_angles(double base, int levels, const float *DISTI_RESTR
     {                                                                                                                  \
         disti_norm_lanes(units, DISTI_BLOCK, epsilon, gamma, beta, x, hat, inverse);                                   \
     }                                                                                                                  \
+    function void disti_activate_back_##isa(size_t n, size_t half, const float *slope, float *d)                       \
+    {                                                                                                                  \
+        disti_activate_backward(n, half, slope, d);                                                                    \
+    }                                                                                                                  \
+    function void disti_norm_tangents_##isa(int units, float epsilon, const float *gamma, const float *beta, float *x, \
+                                             float *hat, float *inverse)                                               \
+    {                                                                                                                  \
+        disti_norm_tangent_lanes(units, epsilon, gamma, beta, x, hat, inverse);                                        \
+    }                                                                                                                  \
+    function void disti_activate_tangents_##isa(int activation, float scale, size_t n, float *y, float *slope,         \
+                                                 uint64_t *mask)                                                       \
+    {                                                                                                                  \
+        disti_activate_tangents(activation, scale, n, y, slope, mask);                                                 \
+    }                                                                                                                  \
+    function int disti_huge_##isa(size_t n, const float *x) { return disti_huge_any(n, x); }                           \
     function void disti_norm_back_##isa(int units, const float *gamma, size_t half, const float *hat,                  \
                                          const float *inverse, float *d)                                               \
     {                                                                                                                  \
@@ -3454,7 +3569,11 @@ static uint32_t disti_f16_bits(float x) /* not called: dist_net_set_half refuses
     kernels.live = disti_live_##isa; \
     kernels.fit = disti_fit_##isa; \
     kernels.norm = disti_norm_##isa; \
-    kernels.norm_back = disti_norm_back_##isa;
+    kernels.activate_back = disti_activate_back_##isa; \
+    kernels.norm_back = disti_norm_back_##isa; \
+    kernels.norm_tangents = disti_norm_tangents_##isa; \
+    kernels.activate_tangents = disti_activate_tangents_##isa; \
+    kernels.huge = disti_huge_##isa;
 
 /* isa: one that disti_cpu_has */
 static disti_kernels disti_kernels_for(int isa)
@@ -5988,7 +6107,8 @@ struct dist_net {
     int fold_count; /* layers that see the code */
     disti_linear layer[DISTI_MAX_LAYERS];
     float *params, *panels, *codes;
-    int *unit_order; /* (layers, max_rows): the file's units as they stand in the kernels; NULL: as in the file */
+    int *unit_order; /* (2, layers, max_rows): the file's units as they stand in the kernels, and each one's place
+                        there; NULL: as in the file */
     float *half_panels; /* 32 bits each: two 16-bit weights; NULL: none */
     int half;           /* DIST_HALF_F16 or BF16, or 0 */
     unsigned changes;   /* of the weights, so far */
@@ -6149,20 +6269,6 @@ static void disti_encode_backward(const dist_net *net, const disti_block *b, flo
     }
 }
 
-/* disti_norm_lanes of the values in the first `half` lanes, then their tangents in the others:
-   hat' = P x' / sqrt(v + eps),  y' = gamma hat'; the inverse's place gets mean_u (hat x') */
-static void disti_norm_tangents(int units, float epsilon, const float *gamma, const float *beta, size_t half,
-                                float *DISTI_RESTRICT x, float *DISTI_RESTRICT hat, float *DISTI_RESTRICT inverse)
-{
-    size_t count = (size_t)units;
-    disti_norm_lanes(units, half, epsilon, gamma, beta, x, hat, inverse);
-    disti_norm_project(units, half, hat, inverse, x + half, inverse + half);
-    for (size_t u = 0; u < count; u++) {
-        memcpy(hat + u * DISTI_BLOCK + half, x + u * DISTI_BLOCK + half, half * sizeof(float));
-        for (size_t c = half; c < 2 * half; c++) x[u * DISTI_BLOCK + c] *= gamma[u];
-    }
-}
-
 /* Whether no row of layer l's input is looked at for being dead: where none can be, or where only values are wanted and
    the shape's samples met none. */
 static int disti_all_alive(const dist_shape *shape, const disti_block *b, int l)
@@ -6234,67 +6340,53 @@ static int disti_net_sparse(const dist_net *net)
            net->max_rows <= 1100 && disti_net_narrowest(net) >= 96;
 }
 
-/* The file's number of unit u of layer l, and of a row of its input. */
+/* The file's number of unit u of layer l. */
 static size_t disti_unit(const dist_net *net, int l, size_t u)
 {
     return net->unit_order ? (size_t)net->unit_order[(size_t)l * (size_t)net->max_rows + u] : u;
 }
 
-static size_t disti_row(const dist_net *net, int l, size_t k)
+/* Where the file's input k of layer l stands in the kernels. */
+static size_t disti_place_of(const dist_net *net, int l, size_t k)
 {
-    return k < (size_t)net->layer[l].prev ? disti_unit(net, l - 1, k) : k;
+    if (!net->unit_order || k >= (size_t)net->layer[l].prev) return k;
+    return (size_t)net->unit_order[(size_t)(net->layers + l - 1) * (size_t)net->max_rows + k];
 }
 
-/* Layer l's input x to (B, stride), the file's units side by side. */
+/* Layer l's input x to (B, stride), the file's units side by side. A cache line of each column is filled at a time. */
 static void disti_transpose(const dist_net *net, int l, const float *x, float *xt)
 {
+    enum { LINE = 16 };
     const disti_linear *layer = &net->layer[l];
     size_t stride = disti_store_stride(layer), rows = (size_t)(layer->prev + layer->point);
-    for (size_t k = 0; k < rows; k++) {
-        float *to = xt + disti_row(net, l, k);
-        for (size_t c = 0; c < DISTI_BLOCK; c++) to[c * stride] = layer->scale * x[k * DISTI_BLOCK + c];
+    for (size_t first = 0; first < rows; first += LINE) {
+        const float *from[LINE];
+        size_t count = DISTI_MIN(rows - first, (size_t)LINE);
+        for (size_t k = 0; k < count; k++) from[k] = x + disti_place_of(net, l, first + k) * DISTI_BLOCK;
+        for (size_t c = 0; c < DISTI_BLOCK; c++)
+            for (size_t k = 0; k < count; k++) xt[c * stride + first + k] = layer->scale * from[k][c];
     }
-}
-
-/* phi'' of a value v = phi(x) whose slope phi'(x) is d. */
-static float disti_curvature(int activation, float scale, float v, float d)
-{
-    switch (activation) {
-    case DIST_ACTIVATION_ELU: return v > 0.0f ? 0.0f : d;
-    case DIST_ACTIVATION_SOFTPLUS: return scale * d * (1.0f - d);
-    case DIST_ACTIVATION_SINE: return -scale * scale * v;
-    case DIST_ACTIVATION_TANH: return -2.0f * v * d;
-    }
-    return 0.0f;
 }
 
 /* The rest of hidden layer l where lanes are values and tangents: W x in y becomes phi(norm(W x + b)) and, along the
    direction, its derivative phi'(a) a'. slope keeps phi'(a) and, in the tangent's lane, phi''(a) a'. */
-static void disti_hidden_tangents(const dist_shape *shape, const disti_block *b, int l, float *y)
+static void disti_hidden_tangents(const dist_shape *shape, const disti_kernels *kernels, const disti_block *b, int l,
+                                  float *y)
 {
     const dist_net *net = shape->net;
     const disti_linear *layer = &net->layer[l];
-    size_t width = (size_t)net->max_rows, out = (size_t)layer->out, half = (size_t)b->half;
-    const float *bias = shape->bias + (size_t)l * width;
-    float own[DISTI_BLOCK], scale = l == 0 ? net->first_scale : net->scale;
-    uint64_t *mask = b->mask + (size_t)(l + 1) * width;
-    for (size_t u = 0; u < out; u++)
-        for (size_t c = 0; c < half; c++) y[u * DISTI_BLOCK + c] += bias[u];
-    if (net->normed)
-        disti_norm_tangents(layer->out, net->norm_epsilon, net->params + layer->norm_weight,
-                            net->params + layer->norm_bias, half, y, b->hat + (size_t)l * width * DISTI_BLOCK,
-                            b->inverse + (size_t)l * DISTI_BLOCK);
+    size_t width = (size_t)net->max_rows, out = (size_t)layer->out, at = (size_t)l * width;
+    const float *bias = shape->bias + at;
     for (size_t u = 0; u < out; u++) {
-        float *v = y + u * DISTI_BLOCK, *slope = b->slope ? b->slope + ((size_t)l * width + u) * DISTI_BLOCK : own;
-        disti_activate(net->activation, scale, half, v, slope);
-        mask[u] = 0;
-        for (size_t c = 0; c < half; c++) {
-            slope[half + c] = disti_curvature(net->activation, scale, v[c], slope[c]) * v[half + c];
-            v[half + c] *= slope[c];
-            mask[u] |= (uint64_t)(slope[c] > 0.0f) << c;
-        }
-        mask[u] |= mask[u] << half; /* ReLU's: a value and its tangent are alive together */
+        const float add = bias[u];
+        for (size_t c = 0; c < DISTI_BLOCK / 2; c++) y[u * DISTI_BLOCK + c] += add;
     }
+    if (net->normed)
+        kernels->norm_tangents(layer->out, net->norm_epsilon, net->params + layer->norm_weight,
+                               net->params + layer->norm_bias, y, b->hat + at * DISTI_BLOCK,
+                               b->inverse + (size_t)l * DISTI_BLOCK);
+    kernels->activate_tangents(net->activation, l == 0 ? net->first_scale : net->scale, out, y,
+                               b->slope ? b->slope + at * DISTI_BLOCK : NULL, b->mask + at + width);
 }
 
 /* Hidden layer l: x to the input of layer l + 1 in y, with everything that its adjoint reads. */
@@ -6329,7 +6421,7 @@ static void disti_hidden(const dist_shape *shape, const disti_kernels *kernels, 
         kernels->norm(layer->out, net->norm_epsilon, net->params + layer->norm_weight, net->params + layer->norm_bias,
                       y, b->hat + (size_t)l * width * DISTI_BLOCK, b->inverse + (size_t)l * DISTI_BLOCK);
     if (b->half) {
-        disti_hidden_tangents(shape, b, l, y);
+        disti_hidden_tangents(shape, kernels, b, l, y);
     } else if (net->activation != DIST_ACTIVATION_RELU) {
         float *slope = b->values ? NULL : b->slope + (size_t)l * width * DISTI_BLOCK;
         kernels->activate(net->activation, l == 0 ? net->first_scale : net->scale, out * DISTI_BLOCK, y, slope);
@@ -6414,17 +6506,7 @@ static void disti_hidden_delta(const dist_net *net, const disti_kernels *kernels
     const disti_linear *layer = &net->layer[l];
     size_t width = (size_t)net->max_rows, out = (size_t)layer->out;
     if (net->activation == DIST_ACTIVATION_RELU && !net->normed) return;
-    if (b->slope) {
-        const float *slope = b->slope + (size_t)l * width * DISTI_BLOCK;
-        size_t half = (size_t)b->half;
-        for (size_t i = 0; i < out * DISTI_BLOCK && !half; i++) delta[i] *= slope[i];
-        for (size_t i = 0; i < out * DISTI_BLOCK && half; i += DISTI_BLOCK) {
-            for (size_t c = i; c < i + half; c++) {
-                delta[c] = slope[c] * delta[c] + slope[c + half] * delta[c + half];
-                delta[c + half] *= slope[c];
-            }
-        }
-    }
+    if (b->slope) kernels->activate_back(out, (size_t)b->half, b->slope + (size_t)l * width * DISTI_BLOCK, delta);
     if (net->normed) {
         const uint64_t *mask = b->mask + (size_t)(l + 1) * width; /* rows that are not alive were not written */
         if (net->activation == DIST_ACTIVATION_RELU)
@@ -7412,6 +7494,23 @@ static disti_weights_job disti_weights_begin(const dist_shape *shape, size_t n, 
     return job;
 }
 
+/* Whether a number of a block's store is so large that products with others may overflow. */
+static int disti_weights_huge(const dist_net *net, const disti_kernels *kernels, size_t columns, size_t channels,
+                              const float *store)
+{
+    int huge = 0;
+    for (int l = 0; l < net->layers && !huge; l++) {
+        const disti_linear *layer = &net->layer[l];
+        size_t rows = l + 1 == net->layers ? channels : (size_t)layer->out;
+        const float *input = store + disti_store_offset(net, l, DISTI_STORE_INPUT);
+        const float *delta = store + disti_store_offset(net, l, DISTI_STORE_DELTA);
+        const float *norm = store + disti_store_offset(net, l, DISTI_STORE_NORM);
+        huge = kernels->huge(columns * disti_store_stride(layer), input) || kernels->huge(rows * DISTI_BLOCK, delta) ||
+               kernels->huge(net->normed ? 2 * disti_store_out(layer) : 0, norm);
+    }
+    return huge;
+}
+
 /* Points whose numbers somewhere in the net are so large that their products overflow give no weight gradient, rather
    than spoil that of all the others: their inputs and deltas in the store become 0. channels: the store's of the last
    layer. */
@@ -7472,7 +7571,9 @@ static void disti_weights_block(void *arg, int index, int worker)
         }
         disti_encode_backward(net, &b, b.pull);
     }
-    disti_weights_drop(net, job->directions ? (size_t)DISTI_BLOCK : count, job->d_color ? 3 : 1, store);
+    size_t columns = job->directions ? (size_t)DISTI_BLOCK : count, channels = job->d_color ? 3 : 1;
+    if (disti_weights_huge(net, &b.kernels, columns, channels, store))
+        disti_weights_drop(net, columns, channels, store);
     for (size_t i = 0; job->d_points && i < 3 * count; i++) job->d_points[3 * at + i] += b.pull[i];
     if (!job->d_code) return;
     disti_fold_begin(net, &b);
@@ -7488,44 +7589,45 @@ static int disti_weights_channel(const disti_weights_job *job)
     return job->d_color ? job->shape->net->color_channel : job->shape->net->sdf_channel;
 }
 
-/* Adds one block's share to `count` rows of layer l from row `o`, counted from the job's channel in the last layer. */
-static void disti_weights_rows(const disti_weights_job *job, int l, size_t o, size_t count, int index)
+/* Adds one block's share to `count` rows of layer l from row `o`, counted from the job's channel in the last layer;
+   but for the code's columns: total gets the sums of the rows' deltas. */
+static void disti_weights_rows(const disti_weights_job *job, const disti_kernels *kernels, int l, size_t o,
+                               size_t count, int index, double *total)
 {
     const dist_shape *shape = job->shape;
     const dist_net *net = shape->net;
     const disti_linear *layer = &net->layer[l];
-    disti_kernels kernels = disti_kernels_for(shape->ctx->isa);
     const float *store = shape->ctx->store + (size_t)index * shape->store_block_size;
     const float *xt = store + disti_store_offset(net, l, DISTI_STORE_INPUT);
-    const float *delta = store + disti_store_offset(net, l, DISTI_STORE_DELTA) + o * DISTI_BLOCK;
     size_t row = l + 1 == net->layers ? (size_t)disti_weights_channel(job) : o;
     size_t values = DISTI_MIN(job->n - job->first - (size_t)index * job->block, job->block);
-    size_t columns = job->directions ? (size_t)DISTI_BLOCK : values; /* tangents have no share in the bias */
-    float *w = job->d_weights + layer->weight + row * (size_t)layer->in;
+    float *w = job->d_weights + layer->weight + row * (size_t)layer->in, ones[16], sum[DISTI_WEIGHT_ROWS];
     disti_gemm_weights g;
-    g.d_y = delta;
+    g.d_y = store + disti_store_offset(net, l, DISTI_STORE_DELTA) + o * DISTI_BLOCK;
     g.xt = xt;
     g.d_weights = w + layer->x_column;
     g.stride = (size_t)layer->in;
     g.xt_stride = disti_store_stride(layer);
     g.out = (int)count;
     g.rows = layer->prev;
-    g.columns = (int)columns;
-    if (layer->prev > 0) kernels.gemm_weights(&g);
+    g.columns = job->directions ? DISTI_BLOCK : (int)values;
+    kernels->gemm_weights(&g);
+    g.xt = xt + layer->prev;
+    g.d_weights = w + layer->point_column;
+    g.rows = layer->point;
+    kernels->gemm_weights(&g);
+    for (size_t i = 0; i < 16; i++) ones[i] = 1.0f;
+    memset(sum, 0, sizeof sum);
+    g.xt = ones; /* for every column */
+    g.xt_stride = 0;
+    g.d_weights = sum;
+    g.stride = 1;
+    g.rows = 1;
+    g.columns = (int)values; /* tangents have no share in the bias */
+    kernels->gemm_weights(&g);
     for (size_t i = 0; i < count; i++) {
-        float sum = 0.0f;
-        for (size_t c = 0; c < values; c++) sum += delta[i * DISTI_BLOCK + c];
-        job->d_weights[layer->bias + row + i] += sum;
-        float *to = w + i * (size_t)layer->in;
-        for (size_t k = 0; k < (size_t)layer->point; k++) {
-            float s = 0.0f;
-            for (size_t c = 0; c < columns; c++)
-                s += delta[i * DISTI_BLOCK + c] * xt[c * g.xt_stride + (size_t)layer->prev + k];
-            to[(size_t)layer->point_column + k] += s;
-        }
-        for (size_t j = 0; j < (size_t)layer->code; j++)
-            disti_add_gradient(&to[(size_t)layer->code_column + j],
-                               (double)layer->scale * (double)sum * (double)shape->code[j]);
+        job->d_weights[layer->bias + row + i] += sum[i];
+        total[i] += (double)sum[i];
     }
     if (!net->normed || l + 1 == net->layers) return;
     const float *sums = store + disti_store_offset(net, l, DISTI_STORE_NORM);
@@ -7538,7 +7640,9 @@ static void disti_weights_rows(const disti_weights_job *job, int l, size_t o, si
 static void disti_weights_task(void *arg, int index, int worker)
 {
     const disti_weights_job *job = (const disti_weights_job *)arg;
-    const dist_net *net = job->shape->net;
+    const dist_shape *shape = job->shape;
+    const dist_net *net = shape->net;
+    const disti_kernels kernels = disti_kernels_for(shape->ctx->isa);
     (void)worker;
     int l = 0;
     size_t o = (size_t)index * DISTI_WEIGHT_ROWS;
@@ -7547,9 +7651,18 @@ static void disti_weights_task(void *arg, int index, int worker)
         if (o < rows) break;
         o -= rows;
     }
-    size_t out = l + 1 < net->layers ? (size_t)net->layer[l].out : job->d_color ? 3 : 1;
+    const disti_linear *layer = &net->layer[l];
+    size_t out = l + 1 < net->layers ? (size_t)layer->out : job->d_color ? 3 : 1;
     size_t count = DISTI_MIN((size_t)DISTI_WEIGHT_ROWS, out - o);
-    for (int i = 0; i < job->blocks; i++) disti_weights_rows(job, l, o, count, i);
+    size_t row = l + 1 == net->layers ? (size_t)disti_weights_channel(job) : o;
+    double total[DISTI_WEIGHT_ROWS];
+    memset(total, 0, sizeof total);
+    for (int i = 0; i < job->blocks; i++) disti_weights_rows(job, &kernels, l, o, count, i, total);
+    for (size_t i = 0; i < count; i++) {
+        float *to = job->d_weights + layer->weight + (row + i) * (size_t)layer->in + layer->code_column;
+        for (size_t j = 0; j < (size_t)layer->code; j++)
+            disti_add_gradient(&to[j], (double)layer->scale * total[i] * (double)shape->code[j]);
+    }
 }
 
 /* Both phases, chunk by chunk. ctx->partial holds at least store_blocks sums of code_size if d_code is wanted. */
@@ -8012,7 +8125,8 @@ DIST_API void dist_net_destroy(dist_net *net)
     if (net->panels) allocator.free_fn(allocator.user, net->panels, net->panel_count * sizeof(float));
     if (net->half_panels) allocator.free_fn(allocator.user, net->half_panels, net->half_count * sizeof(float));
     if (net->unit_order)
-        allocator.free_fn(allocator.user, net->unit_order, (size_t)net->layers * (size_t)net->max_rows * sizeof(int));
+        allocator.free_fn(allocator.user, net->unit_order,
+                          2 * (size_t)net->layers * (size_t)net->max_rows * sizeof(int));
     if (net->codes)
         allocator.free_fn(allocator.user, net->codes, (size_t)net->code_count * (size_t)net->code_size * sizeof(float));
     allocator.free_fn(allocator.user, net, sizeof *net);
@@ -8138,7 +8252,7 @@ static void disti_net_pack(dist_net *net)
         for (size_t o = 0; o < (size_t)layer->out; o++) {
             const float *w = net->params + layer->weight + (last ? o : disti_unit(net, l, o)) * (size_t)layer->in;
             for (size_t k = 0; k < rows; k++) {
-                size_t column = k < (size_t)layer->prev ? (size_t)layer->x_column + disti_row(net, l, k)
+                size_t column = k < (size_t)layer->prev ? (size_t)layer->x_column + disti_unit(net, l - 1, k)
                                                         : (size_t)layer->point_column + k - (size_t)layer->prev;
                 size_t at = last ? o * rows + k : (o / 8 * rows + k) * 8 + o % 8;
                 net->panels[layer->panel + at] = layer->scale * w[column];
@@ -8154,7 +8268,7 @@ static void disti_net_pack(dist_net *net)
 static void disti_net_sort(const dist_context *ctx, dist_net *net)
 {
     enum { CODES = 3, ROUNDS = 3 };
-    int units = net->unit_order ? net->layers * net->max_rows : 0;
+    int units = net->unit_order ? 2 * net->layers * net->max_rows : 0;
     for (int i = 0; i < units; i++) net->unit_order[i] = i % net->max_rows;
     disti_net_pack(net);
     if (!net->unit_order) return;
@@ -8211,6 +8325,7 @@ static void disti_net_sort(const dist_context *ctx, dist_net *net)
         for (int often = ROUNDS * CODES * DISTI_BLOCK; often >= 0; often--)
             for (int o = 0; o < net->layer[l].out; o++)
                 if (alive[o] == often) order[place++] = o;
+        while (place-- > 0) order[all + (size_t)order[place]] = place;
     }
     disti_net_pack(net);
 }
@@ -8579,7 +8694,8 @@ static dist_status disti_loader_arrange(disti_loader *loader)
     /* of smaller ones so little comes from beyond the second cache that their order hardly matters */
     int order = disti_net_sparse(net) && net->max_rows >= 384 && !loader->ctx->blas.sgemm_fn;
     if (status != DIST_OK || !order) return status;
-    net->unit_order = (int *)disti_alloc_array(loader->ctx, (size_t)net->layers * (size_t)net->max_rows, sizeof(int));
+    net->unit_order = (int *)disti_alloc_array(loader->ctx, 2 * (size_t)net->layers * (size_t)net->max_rows,
+                                               sizeof(int));
     return net->unit_order ? DIST_OK : DIST_OUT_OF_MEMORY;
 }
 

@@ -393,6 +393,45 @@ static void check_plain_case(const disti_kernels *kernels, test_random *random, 
             if (slopes) CHECK_NEAR_ARRAY(n, slope_a, slope_b, 2e-6 * (double)scale);
         }
     }
+    for (int activation = DIST_ACTIVATION_RELU; activation <= DIST_ACTIVATION_NONE; activation++) {
+        const float scale = activation == DIST_ACTIVATION_SINE ? 30.0f : 2.0f;
+        memcpy(a, x, n * sizeof *x);
+        memcpy(b, x, n * sizeof *x);
+        memset(mask, 0, sizeof mask);
+        scalar.activate_tangents(activation, scale, rows, a, slope_a, mask[0]);
+        kernels->activate_tangents(activation, scale, rows, b, slope_b, mask[1]);
+        CHECK_NEAR_ARRAY(n, a, b, 1e-5 * (double)scale);
+        CHECK_NEAR_ARRAY(n, slope_a, slope_b, 1e-5 * (double)(scale * scale));
+        CHECK_BYTES(rows * sizeof **mask, mask[0], mask[1]);
+        kernels->activate_tangents(activation, scale, rows, memcpy(a, x, n * sizeof *x), NULL, mask[0]);
+        CHECK_BYTES(n * sizeof *x, a, b);
+        for (size_t half = 0; half <= TEST_BLOCK / 2; half += TEST_BLOCK / 2) {
+            memcpy(a, x, n * sizeof *x);
+            memcpy(b, x, n * sizeof *x);
+            scalar.activate_back(rows, half, slope_a, a);
+            kernels->activate_back(rows, half, slope_a, b);
+            CHECK_NEAR_ARRAY(n, a, b, 1e-5 * (double)(scale * scale));
+        }
+    }
+    CHECK(!kernels->huge(0, x) && !kernels->huge(n, x));
+    for (int i = 0; i < 8; i++) {
+        size_t at = (size_t)test_random_int(random, 0, (int)n - 1);
+        float kept = x[at];
+        x[at] = i % 2 ? 7.3e16f : -7.3e16f;
+        CHECK(kernels->huge(at + 1, x) && !kernels->huge(at, x));
+        x[at] = i % 2 ? 7.1e16f : -7.1e16f;
+        CHECK(!kernels->huge(n, x));
+        x[at] = test_nan();
+        CHECK(kernels->huge(n, x));
+        x[at] = kept;
+    }
+    memcpy(a, x, n * sizeof *x);
+    memcpy(b, x, n * sizeof *x);
+    scalar.norm_tangents(size.rows, 1e-2f, gamma, beta, a, slope_a, inverse[0]);
+    kernels->norm_tangents(size.rows, 1e-2f, gamma, beta, b, slope_b, inverse[1]);
+    CHECK_NEAR_ARRAY(n, a, b, 1e-3);
+    CHECK_NEAR_ARRAY(n, slope_a, slope_b, 1e-3);
+    CHECK_NEAR_ARRAY(TEST_BLOCK, inverse[0], inverse[1], 1e-3);
     memcpy(a, x, n * sizeof *x);
     memcpy(b, x, n * sizeof *x);
     scalar.norm(size.rows, 1e-2f, gamma, beta, a, slope_a, inverse[0]);

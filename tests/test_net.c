@@ -452,7 +452,11 @@ TEST(the_order_of_units_in_memory_does_not_show)
                 REQUIRE(*unit >= 0 && *unit < net->layer[l].out && !seen[*unit]);
                 seen[*unit] = 1;
                 moved += *unit != i;
-                if (mode) *unit = i;
+                CHECK_EQUAL(i, net->unit_order[(net->layers + l) * net->max_rows + *unit]);
+            }
+            for (int i = 0; mode && i < net->layer[l].out; i++) {
+                net->unit_order[l * net->max_rows + i] = i;
+                net->unit_order[(net->layers + l) * net->max_rows + i] = i;
             }
         }
         CHECK(moved > 100);

@@ -6424,7 +6424,14 @@ static void disti_hidden(const dist_shape *shape, const disti_kernels *kernels, 
         disti_hidden_tangents(shape, kernels, b, l, y);
     } else if (net->activation != DIST_ACTIVATION_RELU) {
         float *slope = b->values ? NULL : b->slope + (size_t)l * width * DISTI_BLOCK;
-        kernels->activate(net->activation, l == 0 ? net->first_scale : net->scale, out * DISTI_BLOCK, y, slope);
+        float scale = l == 0 ? net->first_scale : net->scale;
+        size_t n = out, lanes = disti_round_up((size_t)b->columns, 16); /* idle ones are nobody's */
+        if (lanes == DISTI_BLOCK) { /* at once */
+            lanes *= n;
+            n = 1;
+        }
+        for (size_t i = 0; i < n * DISTI_BLOCK; i += DISTI_BLOCK)
+            kernels->activate(net->activation, scale, lanes, y + i, slope ? slope + i : NULL);
     } else if (!plain) {
         kernels->relu(out, y, mask);
         for (size_t u = 0; b->columns < DISTI_BLOCK && u < out; u++) /* the others hold what was there before */

@@ -4,7 +4,8 @@
 
    mode dense: every unit alive, so every multiply-add is done. dead: a real decoder at its own surface, where most
    units are zero and left out; its rate counts what a dense net would do. backward: value and gradient at the point;
-   backward_code: that and the code's gradient. Beside a real decoder are all_alive, all_alive_backward and
+   backward_code: that and the code's gradient; weights: the gradients of a loss on f for all weights and the code;
+   eikonal: those of (|grad f| - 1)^2. Beside a real decoder are all_alive, all_alive_backward and
    all_alive_backward_code: a net of the same layers without a dead unit at the same points; of_alive is a mode's time
    over that net's, reverse_of_alive the same of what backward takes more than the forward pass. f16, bf16, and
    f16_dead, bf16_dead: the hidden layers in 16 bits, where the processor has the instructions, against the peak of
@@ -26,6 +27,7 @@ static const char usage[] =
     "  --threads N        besides 1, where the build has OpenMP (default 2)\n"
     "  --model FILE       a decoder at its own surface instead of the random nets; or the word embedded\n"
     "  --code N           which of its codes (default 0)\n"
+    "  --activation NAME  of the random nets: relu (default), elu, softplus, sine or tanh\n"
     "  --repetitions N    of each measurement (default 9)\n"
     "  --best             the fastest of them, not the median: for a machine that others use too\n"
     "  --quick            the two extreme cases, one thread, short\n";
@@ -41,11 +43,24 @@ static const net_case cases[] = {
 };
 
 enum { CASES = sizeof cases / sizeof cases[0], REPETITIONS_MAX = 1001 };
-enum { FORWARD, BACKWARD, BACKWARD_CODE, ALIVE, ALIVE_BACKWARD, ALIVE_BACKWARD_CODE, F16, BF16, MODES };
+enum {
+    FORWARD,
+    BACKWARD,
+    BACKWARD_CODE,
+    WEIGHTS,
+    EIKONAL,
+    ALIVE,
+    ALIVE_BACKWARD,
+    ALIVE_BACKWARD_CODE,
+    F16,
+    BF16,
+    MODES
+};
+static const char *const activations[] = {"relu", "elu", "softplus", "sine", "tanh", NULL}; /* DIST_ACTIVATION_* */
 
 typedef struct settings {
     const char *only_case, *only_isa, *model;
-    int code, threads, repetitions, best, quick;
+    int code, threads, repetitions, best, quick, activation;
 } settings;
 
 /* ---- what is measured -------------------------------------------------------------------------------------------- */
@@ -56,7 +71,7 @@ typedef struct work {
     dist_field field, alive, half[2]; /* alive: without dead units; half: in f16 and bf16; without eval_fn: not here */
     size_t batch;
     const float *points;
-    float *sdf, *other_sdf, *gradient, *d_sdf, *d_code; /* sdf: of f32 forward */
+    float *sdf, *other_sdf, *gradient, *d_sdf, *d_code, *d_weights; /* sdf: of f32 forward */
     double operations;
 } work;
 
@@ -82,6 +97,16 @@ static void work_once(const work *w, int mode)
     case ALIVE_BACKWARD_CODE:
         dist_field_backward(w->ctx, field, w->batch, w->points, w->d_sdf, seed_ones, NULL, w->gradient, &grads);
         break;
+    case WEIGHTS:
+        grads.weights = w->d_weights;
+        dist_field_backward(w->ctx, field, w->batch, w->points, w->d_sdf, seed_ones, NULL, NULL, &grads);
+        break;
+    case EIKONAL: {
+        float loss = 0;
+        grads.weights = w->d_weights;
+        dist_field_eikonal(w->ctx, field, w->batch, w->points, 1.0f, &loss, &grads);
+        break;
+    }
     default: dist_field_eval(w->ctx, field, w->batch, w->points, sdf, NULL);
     }
 }
@@ -134,9 +159,9 @@ static int has_mode(const work *w, int mode)
 static void measure(const settings *s, const char *name, const work *w, const work *one, int dead)
 {
     static const char *const names[2][MODES] = {
-        {"dense", "backward", "backward_code", "", "", "", "f16", "bf16"},
-        {"dead", "backward", "backward_code", "all_alive", "all_alive_backward", "all_alive_backward_code", "f16_dead",
-         "bf16_dead"}};
+        {"dense", "backward", "backward_code", "weights", "eikonal", "", "", "", "f16", "bf16"},
+        {"dead", "backward", "backward_code", "weights", "eikonal", "all_alive", "all_alive_backward",
+         "all_alive_backward_code", "f16_dead", "bf16_dead"}};
     static double peaks[3][REPETITIONS_MAX], times[MODES][REPETITIONS_MAX]; /* peaks: f32, f16, bf16 */
     double fastest[2][MODES] = {{0}}; /* passes a second, of one thread and of all */
     double highest[2] = {0, 0};
@@ -190,7 +215,7 @@ static void measure(const settings *s, const char *name, const work *w, const wo
         double speedup = one && m < ALIVE ? fastest[1][m] / fastest[0][m] : 0;
         double of_alive = 0;
         double reverse = 0;
-        if (m < ALIVE && has_mode(w, ALIVE + m)) {
+        if (m < WEIGHTS && has_mode(w, ALIVE + m)) {
             double alive = quantile(n, times[ALIVE + m], share);
             of_alive = seconds / alive;
             reverse = m == FORWARD ? 0 : (seconds - forward) / (alive - quantile(n, times[ALIVE], share));
@@ -204,7 +229,7 @@ static void measure(const settings *s, const char *name, const work *w, const wo
     fflush(stdout);
 }
 
-static dist_net *make_net(dist_context *ctx, const net_case *c)
+static dist_net *make_net(dist_context *ctx, const net_case *c, int activation)
 {
     dist_net_desc desc;
     memset(&desc, 0, sizeof desc);
@@ -213,6 +238,7 @@ static dist_net *make_net(dist_context *ctx, const net_case *c)
     desc.skip = c->skip;
     desc.code_size = c->code_size;
     desc.seed = 1;
+    desc.activation = activation;
     dist_net *net = dist_net_create(ctx, &desc);
     check(ctx);
     make_alive(ctx, net);
@@ -278,7 +304,7 @@ static void measure_net(const settings *s, const net_case *c, int isa, int threa
     memset(&w, 0, sizeof w);
     w.ctx = dist_context_create(&desc);
     check(w.ctx);
-    dist_net *net = c ? make_net(w.ctx, c) : load_model(w.ctx, s->model);
+    dist_net *net = c ? make_net(w.ctx, c, s->activation) : load_model(w.ctx, s->model);
     const float *code = c ? NULL : dist_net_code(net, s->code);
     if (!c && dist_net_code_size(net) && !code) { fail("%s has no code %d", s->model, s->code); }
     dist_shape *shape = dist_shape_create(w.ctx, net, code);
@@ -296,12 +322,13 @@ static void measure_net(const settings *s, const net_case *c, int isa, int threa
     w.d_sdf = take_floats(w.batch);
     w.gradient = take_floats(3 * w.batch);
     if (dist_net_code_size(net)) { w.d_code = take_floats((size_t)dist_net_code_size(net)); }
+    w.d_weights = take_floats(dist_net_weight_count(net));
     dist_net *halves[2] = {NULL, NULL};
     dist_shape *shapes[2] = {NULL, NULL};
     for (int k = 0; k < 2 && isa == DIST_ISA_AVX512; k++) {
         int kind = k == 0 ? DIST_HALF_F16 : DIST_HALF_BF16;
         if (!disti_cpu_half(kind) || net->normed) { continue; }
-        halves[k] = c ? make_net(w.ctx, c) : load_model(w.ctx, s->model);
+        halves[k] = c ? make_net(w.ctx, c, s->activation) : load_model(w.ctx, s->model);
         dist_net_set_half(w.ctx, halves[k], kind);
         shapes[k] = dist_shape_create(w.ctx, halves[k], code);
         check(w.ctx);
@@ -339,6 +366,7 @@ static void measure_net(const settings *s, const net_case *c, int isa, int threa
     free(w.d_sdf);
     free(w.gradient);
     free(w.d_code);
+    free(w.d_weights);
     dist_shape_destroy(shape);
     dist_net_destroy(net);
     dist_context_destroy(w.ctx);
@@ -346,7 +374,7 @@ static void measure_net(const settings *s, const net_case *c, int isa, int threa
 
 static settings read_options(int argc, char **argv)
 {
-    settings s = {NULL, NULL, NULL, 0, 2, 9, 0, 0};
+    settings s = {NULL, NULL, NULL, 0, 2, 9, 0, 0, 0};
     options o = options_begin(argc, argv, usage);
     while (option_next(&o)) {
         if (option_is(&o, "--case")) {
@@ -359,6 +387,8 @@ static settings read_options(int argc, char **argv)
             s.model = option_text(&o);
         } else if (option_is(&o, "--code")) {
             s.code = option_int(&o, 0, 1 << 30);
+        } else if (option_is(&o, "--activation")) {
+            s.activation = option_choice(&o, activations);
         } else if (option_is(&o, "--repetitions")) {
             s.repetitions = option_int(&o, 1, REPETITIONS_MAX);
         } else if (option_is(&o, "--best")) {

@@ -12009,9 +12009,35 @@ static int disti_silhouette_between(const disti_tracer *tracer, const disti_tile
     return agree;
 }
 
+/* h: a power of two */
 static int disti_silhouette_node(const disti_tile *tile, int x, int y, int h)
 {
-    return (x % h == 0 || x == tile->width - 1) && (y % h == 0 || y == tile->height - 1);
+    return (!(x & (h - 1)) || x == tile->width - 1) && (!(y & (h - 1)) || y == tile->height - 1);
+}
+
+/* A node of distance h: from f = enough on it takes what the four twice as far apart say, else it asks there. */
+static size_t disti_silhouette_place(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench,
+                                     int x, int y, int h, float enough, size_t count)
+{
+    int index = y * tile->width + x, agree = 0;
+    int block = y / DISTI_LEAST_BLOCK * DISTI_LEAST_ROW + x / DISTI_LEAST_BLOCK;
+    float t = bench->least_of->t[block], f = bench->least_of->f[block];
+    disti_ray *ray = &bench->rays[index];
+    if (h < 2 * DISTI_NODE) {
+        if (disti_silhouette_node(tile, x, y, 2 * h)) return count;
+        float between = 0.0f, value = 0.0f;
+        agree = disti_silhouette_between(tracer, tile, bench, x, y, 2 * h, &between, &value);
+        if (agree) t = between;
+        if (agree) f = value;
+    }
+    float s = f < 2e38f ? (float)((double)t - ray->base) : 0.0f;
+    if (agree == 4 && f > enough) {
+        disti_keep_least(ray, s, f);
+        return count;
+    }
+    if (agree || h == 2 * DISTI_NODE || ray->fbest > 2e38f) count = disti_silhouette_ask(bench, index, s, count);
+    if (h >= DISTI_NODE) ray->width = h == DISTI_NODE ? 0.35f : 0.7f;
+    return count;
 }
 
 static void disti_silhouette(const disti_tracer *tracer, int worker, const disti_tile *tile, const disti_bench *bench)
@@ -12028,28 +12054,10 @@ static void disti_silhouette(const disti_tracer *tracer, int worker, const disti
         /* from this f on nodes 2 h apart do for what lies between them; that of a plateau is all the same */
         float apart = 2.0f * (float)h / (float)DISTI_NODE, enough = DISTI_MIN(apart * apart * far, plateau);
         size_t count = 0;
-        for (int i = 0; i < n; i++) {
-            disti_ray *ray = &bench->rays[i];
-            int x = i % w, y = i / w, agree = 0;
-            int block = y / DISTI_LEAST_BLOCK * DISTI_LEAST_ROW + x / DISTI_LEAST_BLOCK;
-            float t = bench->least_of->t[block], f = bench->least_of->f[block];
-            if (!disti_wants_minimum(ray) || !disti_silhouette_node(tile, x, y, h)) continue;
-            if (h < 2 * DISTI_NODE) {
-                if (disti_silhouette_node(tile, x, y, 2 * h)) continue;
-                float between = 0.0f, value = 0.0f;
-                agree = disti_silhouette_between(tracer, tile, bench, x, y, 2 * h, &between, &value);
-                if (agree) t = between;
-                if (agree) f = value;
-            }
-            float s = f < 2e38f ? (float)((double)t - ray->base) : 0.0f;
-            if (agree == 4 && f > enough) {
-                disti_keep_least(ray, s, f);
-                continue;
-            }
-            if (agree || h == 2 * DISTI_NODE || ray->fbest > 2e38f)
-                count = disti_silhouette_ask(bench, i, s, count);
-            if (h >= DISTI_NODE) ray->width = h == DISTI_NODE ? 0.35f : 0.7f;
-        }
+        for (int y = 0; y < tile->height; y++)
+            for (int x = 0; x < w; x++)
+                if (disti_silhouette_node(tile, x, y, h) && disti_wants_minimum(&bench->rays[y * w + x]))
+                    count = disti_silhouette_place(tracer, tile, bench, x, y, h, enough, count);
         disti_silhouette_take(tracer, worker, bench, count);
         if (h < DISTI_NODE) continue;
         for (int i = 0; i < n; i++)
@@ -12594,16 +12602,14 @@ static void disti_render_colors(const disti_render_job *job, int worker, const d
 }
 
 /* Point of a ray off the bounding sphere that is nearest to it: the closest approach or, where that lies behind the
-   camera, the camera. Returns its distance from the sphere's center; away: the unit vector from there. */
+   camera, the camera. Returns its distance from the sphere's center; away: the way from there, as long. */
 static double disti_ray_nearest(const dist_field *field, const disti_ray *ray, double point[3], double away[3])
 {
     for (int i = 0; i < 3; i++) {
         point[i] = (double)ray->origin[i] - DISTI_MIN(ray->base, 0.0) * (double)ray->direction[i];
         away[i] = point[i] - (double)field->center[i];
     }
-    double distance = sqrt(disti_dot(away, away));
-    disti_normalize(away);
-    return distance;
+    return sqrt(disti_dot(away, away));
 }
 
 /* Value of the soft silhouette of a finished ray: signed f at a hit, |f| at a miss, less epsilon; off the sphere the
@@ -14238,6 +14244,7 @@ static void disti_backward_pixel(disti_render_backward_job *job, size_t pixel, f
     disti_tape_ray(job, pixel, local, &ray, p);
     if (ray.enter >= ray.leave) { /* off the sphere: only the camera feels it */
         disti_ray_nearest(field, &ray, nearest, pull);
+        disti_normalize(pull);
         for (int i = 0; i < 3; i++) pull[i] *= (double)d_silhouette;
         disti_add_pull(job, nearest, pull, 0.0);
         return;

@@ -6922,7 +6922,7 @@ static void disti_group_begin(disti_group *g, int n, const float *points)
 }
 
 /* Layer l's input of block j, of which `units` rows listed in g->unit were computed: the list of the alive ones, then
-   the point's, which it writes, and their model. */
+   the point's, which it writes, and their model, where a layer follows whose units are bounded by it. */
 static void disti_group_input(const dist_shape *shape, const disti_kernels *kernels, disti_group *g, int l, int j,
                               int units, float slack)
 {
@@ -6950,7 +6950,7 @@ static void disti_group_input(const dist_shape *shape, const disti_kernels *kern
     fit.slack = slack;
     fit.count = count;
     fit.columns = (g->count[j] + 15) / 16 * 16;
-    kernels->fit(&fit);
+    if (l + 1 < net->layers) kernels->fit(&fit);
     g->alive_units[j][l] = count;
     for (int i = 0; i < layer->point; i++, count++) {
         float *m = model + (size_t)count * 8, c = g->center[j][i];

@@ -392,6 +392,11 @@ static void check_plain_case(const disti_kernels *kernels, test_random *random, 
             CHECK_NEAR_ARRAY(n, a, b, 2e-6);
             if (slopes) CHECK_NEAR_ARRAY(n, slope_a, slope_b, 2e-6 * (double)scale);
         }
+#ifndef __FAST_MATH__
+        memcpy(a, x, n * sizeof *x);
+        kernels->activate(activation, scale, n, a, NULL);
+        CHECK_BYTES((n - 2) * sizeof *x, a + 2, b + 2); /* with its slope and without */
+#endif
     }
     for (int activation = DIST_ACTIVATION_RELU; activation <= DIST_ACTIVATION_NONE; activation++) {
         const float scale = activation == DIST_ACTIVATION_SINE ? 30.0f : 2.0f;

@@ -1873,6 +1873,8 @@ typedef struct disti_kernels {
                           float *inverse);
     void (*activate_tangents)(int activation, float scale, size_t n, float *y, float *slope, uint64_t *mask);
     int (*huge)(size_t n, const float *x); /* whether disti_is_huge of any */
+    /* to[c][k] = scale rows[k][c], k < 16, c < B */
+    void (*transpose)(const float *const *rows, float scale, float *to, size_t stride);
 } disti_kernels;
 
 /* The scalar kernels are the definition; the others are measured against them. */
@@ -2341,6 +2343,12 @@ static void disti_few_scalar(const disti_few *g)
             g->most[o] = DISTI_MAX(g->most[o], v);
         }
     }
+}
+
+static void disti_transpose_scalar(const float *const *rows, float scale, float *to, size_t stride)
+{
+    for (size_t c = 0; c < DISTI_BLOCK; c++, to += stride)
+        for (size_t k = 0; k < 16; k++) to[k] = scale * rows[k][c];
 }
 
 static void disti_bound_scalar(const disti_bound *g)
@@ -2999,7 +3007,7 @@ DISTI_PLAIN(scalar, static)
             const size_t row = (size_t)(unsigned)g->list[i];                                                           \
             const float *x = g->x + row * DISTI_BLOCK, *p = g->d, *end = p + g->columns;                               \
             float *m = g->model + (size_t)(unsigned)i * 8;                                                             \
-            DISTI_VEC low = DISTI_SET1(-3e38f), high = low;                                                           \
+            DISTI_VEC low = DISTI_SET1(-3e38f), high = low;                                                            \
             disti_fit_slope(g, row, m);                                                                                \
             const DISTI_VEC u = DISTI_SET1(-m[1]), v = DISTI_SET1(-m[2]), w = DISTI_SET1(-m[3]);                       \
             for (; p < end; p += DISTI_LANES, x += DISTI_LANES) {                                                      \
@@ -3014,6 +3022,14 @@ DISTI_PLAIN(scalar, static)
             }                                                                                                          \
             disti_fit_range(g, -disti_most_##isa(low), disti_most_##isa(high), m);                                     \
         }                                                                                                              \
+    }
+
+#define DISTI_TRANSPOSE(isa)                                                                                           \
+    DISTI_FUNCTION void disti_transpose_##isa(const float *const *rows, float scale, float *to, size_t stride)         \
+    {                                                                                                                  \
+        for (size_t c = 0; c < DISTI_BLOCK; c += 4, to += 4 * stride)                                                  \
+            for (size_t k = 0; k < 16; k += 4)                                                                         \
+                DISTI_TURN(rows[k] + c, rows[k + 1] + c, rows[k + 2] + c, rows[k + 3] + c, scale, to + k, stride)      \
     }
 
 #define DISTI_KERNELS(isa, R, W)                                                                                       \
@@ -3033,6 +3049,7 @@ DISTI_PLAIN(scalar, static)
     DISTI_LAST_LAYER(isa)                                                                                              \
     DISTI_BOUND(isa)                                                                                                   \
     DISTI_FIT(isa)                                                                                                     \
+    DISTI_TRANSPOSE(isa)                                                                                               \
     DISTI_RELU_ROWS(isa)                                                                                               \
     DISTI_PLAIN(isa, DISTI_LOOPS DISTI_FUNCTION)                                                                       \
     DISTI_DRIVERS(isa, R, W)
@@ -3054,6 +3071,18 @@ static const int *disti_back_rows(const disti_gemm_back *g, int rows, int n, int
 
 #ifdef DISTI_X86
 #define DISTI_PREFETCH(p) _mm_prefetch(p, _MM_HINT_T0)
+/* Four vectors of four, scaled: their lanes side by side to four rows. */
+#define DISTI_TURN(p, q, r, t, scale, to, stride)                                                                      \
+    {                                                                                                                  \
+        const __m128 s = _mm_set1_ps(scale);                                                                           \
+        __m128 a0 = _mm_mul_ps(s, _mm_loadu_ps(p)), a1 = _mm_mul_ps(s, _mm_loadu_ps(q));                               \
+        __m128 a2 = _mm_mul_ps(s, _mm_loadu_ps(r)), a3 = _mm_mul_ps(s, _mm_loadu_ps(t));                               \
+        _MM_TRANSPOSE4_PS(a0, a1, a2, a3);                                                                             \
+        _mm_storeu_ps(to, a0);                                                                                         \
+        _mm_storeu_ps((to) + (stride), a1);                                                                            \
+        _mm_storeu_ps((to) + 2 * (stride), a2);                                                                        \
+        _mm_storeu_ps((to) + 3 * (stride), a3);                                                                        \
+    }
 
 #define DISTI_FUNCTION DISTI_TARGET("sse2") DISTI_KERNEL static
 #define DISTI_VEC __m128
@@ -3526,6 +3555,15 @@ static float32x4_t disti_keep_neon(float32x4_t v, uint32_t bits)
 #define DISTI_GREATER(a, b) vmaxq_f32(a, b)
 #define DISTI_ABS(v) vabsq_f32(v)
 #define DISTI_MINUS(v) vnegq_f32(v)
+#define DISTI_TURN(p, q, r, t, scale, to, stride)                                                                      \
+    {                                                                                                                  \
+        const float32x4x2_t a = vtrnq_f32(vmulq_n_f32(vld1q_f32(p), scale), vmulq_n_f32(vld1q_f32(q), scale));         \
+        const float32x4x2_t b = vtrnq_f32(vmulq_n_f32(vld1q_f32(r), scale), vmulq_n_f32(vld1q_f32(t), scale));         \
+        vst1q_f32(to, vcombine_f32(vget_low_f32(a.val[0]), vget_low_f32(b.val[0])));                                   \
+        vst1q_f32((to) + (stride), vcombine_f32(vget_low_f32(a.val[1]), vget_low_f32(b.val[1])));                      \
+        vst1q_f32((to) + 2 * (stride), vcombine_f32(vget_high_f32(a.val[0]), vget_high_f32(b.val[0])));                \
+        vst1q_f32((to) + 3 * (stride), vcombine_f32(vget_high_f32(a.val[1]), vget_high_f32(b.val[1])));                \
+    }
 static float disti_most_neon(float32x4_t v) { return vmaxvq_f32(v); }
 #define DISTI_TWO(p, q) ((void)(q), DISTI_LOAD(p))
 #define DISTI_TWO_STORE(p, q, v) (void)(q); DISTI_STORE(p, v);
@@ -3574,7 +3612,8 @@ static uint32_t disti_f16_bits(float x) /* not called: dist_net_set_half refuses
     kernels.norm_back = disti_norm_back_##isa; \
     kernels.norm_tangents = disti_norm_tangents_##isa; \
     kernels.activate_tangents = disti_activate_tangents_##isa; \
-    kernels.huge = disti_huge_##isa;
+    kernels.huge = disti_huge_##isa; \
+    kernels.transpose = disti_transpose_##isa;
 
 /* isa: one that disti_cpu_has */
 static disti_kernels disti_kernels_for(int isa)
@@ -3682,6 +3721,8 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_BOUND_ZERO
 #undef DISTI_BOUND_STORE
 #undef DISTI_FIT
+#undef DISTI_TURN
+#undef DISTI_TRANSPOSE
 #undef DISTI_MOST4
 #undef DISTI_PREFETCH
 #undef DISTI_FUNCTION
@@ -6355,7 +6396,7 @@ static size_t disti_place_of(const dist_net *net, int l, size_t k)
 }
 
 /* Layer l's input x to (B, stride), the file's units side by side. A cache line of each column is filled at a time. */
-static void disti_transpose(const dist_net *net, int l, const float *x, float *xt)
+static void disti_transpose(const dist_net *net, const disti_kernels *kernels, int l, const float *x, float *xt)
 {
     enum { LINE = 16 };
     const disti_linear *layer = &net->layer[l];
@@ -6364,7 +6405,8 @@ static void disti_transpose(const dist_net *net, int l, const float *x, float *x
         const float *from[LINE];
         size_t count = DISTI_MIN(rows - first, (size_t)LINE);
         for (size_t k = 0; k < count; k++) from[k] = x + disti_place_of(net, l, first + k) * DISTI_BLOCK;
-        for (size_t c = 0; c < DISTI_BLOCK; c++)
+        if (count == LINE) kernels->transpose(from, layer->scale, xt + first, stride);
+        for (size_t c = 0; c < DISTI_BLOCK && count < LINE; c++)
             for (size_t k = 0; k < count; k++) xt[c * stride + first + k] = layer->scale * from[k][c];
     }
 }
@@ -6454,7 +6496,7 @@ static const float *disti_net_forward(const dist_shape *shape, disti_block *b, f
     for (int l = 0; l < net->layers; l++) {
         const disti_linear *layer = &net->layer[l];
         if (store)
-            disti_transpose(net, l, x, store + disti_store_offset(net, l, DISTI_STORE_INPUT));
+            disti_transpose(net, &b->kernels, l, x, store + disti_store_offset(net, l, DISTI_STORE_INPUT));
         done += (double)b->alive_count[l] * layer->out;
         if (l + 1 == net->layers) break;
         disti_hidden(shape, &b->kernels, b, l, x, b->act[l & 1]);

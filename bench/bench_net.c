@@ -406,6 +406,7 @@ int main(int argc, char **argv)
 {
     settings s = read_options(argc, argv);
     int most = 1;
+    if (s.model && s.activation) { fail("--activation is of the random nets, not of --model %s", s.model); }
 #if defined(_OPENMP) && !defined(DIST_NO_OPENMP)
     most = s.quick ? 1 : s.threads;
 #endif

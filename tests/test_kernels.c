@@ -418,6 +418,16 @@ static void check_plain_case(const disti_kernels *kernels, test_random *random, 
             CHECK_NEAR_ARRAY(n, a, b, 1e-5 * (double)(scale * scale));
         }
     }
+    if (rows >= 16) {
+        const float *from[16];
+        const size_t stride = 16 + (size_t)test_random_int(random, 0, 5);
+        float to[TEST_BLOCK * 21];
+        for (size_t k = 0; k < 16; k++) from[k] = x + (k * 7 % 16) * TEST_BLOCK;
+        for (size_t i = 0; i < TEST_BLOCK * 21; i++) to[i] = 7.0f;
+        kernels->transpose(from, 0.3f, to, stride);
+        for (size_t i = 0; i < TEST_BLOCK * stride; i++)
+            CHECK_NEAR(i % stride < 16 ? 0.3 * (double)from[i % stride][i / stride] : 7.0, to[i], 3e-7);
+    }
     CHECK(!kernels->huge(0, x) && !kernels->huge(n, x));
     for (int i = 0; i < 8; i++) {
         size_t at = (size_t)test_random_int(random, 0, (int)n - 1);

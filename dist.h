@@ -2302,7 +2302,7 @@ DISTI_INLINE void disti_norm_backward(int units, const float *gamma, size_t half
         disti_norm_project(units, DISTI_BLOCK, hat, inverse, d, along);
         return;
     }
-    half = DISTI_BLOCK / 2;
+    half = DISTI_BLOCK / 2; /* which it is */
     disti_norm_project(units, half, hat, inverse, d, along);
     memset(cross, 0, sizeof cross);
     for (size_t u = half; u < count; u += DISTI_BLOCK)

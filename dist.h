@@ -6161,6 +6161,7 @@ struct dist_net {
 struct dist_shape {
     dist_context *ctx;
     const dist_net *net;
+    disti_kernels kernels; /* of the context's instructions */
     float *code;
     float *bias; /* (layers + 1, max_rows): each layer's bias with the code folded in; then zeros, for tangents */
     float lipschitz, lipschitz_far, certified, certified_far;
@@ -6200,7 +6201,6 @@ typedef struct disti_block {
     int values; /* no reverse pass follows: masks and slopes need not be kept */
     int channel, channels; /* the output's channels that the reverse pass starts from: the distance, or r, g, b */
     int half; /* 0; or B / 2: lane c + half is the tangent of lane c, see disti_second_block */
-    disti_kernels kernels;
 } disti_block;
 
 /* Returns the bytes needed; base NULL: only that. Sizes are bounded by 32 layers of 8192 + 99 rows. */
@@ -6287,12 +6287,13 @@ static void disti_encode(const dist_net *net, const disti_kernels *kernels, size
 
 /* backward  d_p = d_raw + sum_k b 2^k (cos(b 2^k p) d_sin_k - sin(b 2^k p) d_cos_k)
    The tangents' rows sin' = b 2^k cos u, cos' = -b 2^k sin u have the same adjoint in terms of themselves. */
-static void disti_encode_backward(const dist_net *net, const disti_block *b, float *d_points)
+static void disti_encode_backward(const dist_shape *shape, const disti_block *b, float *d_points)
 {
+    const dist_net *net = shape->net;
     const float *rows = b->point, *d_rows = b->d_point;
     size_t half = (size_t)b->half;
     if (net->raw && net->levels == 0) {
-        b->kernels.points(d_rows, d_points);
+        shape->kernels.points(d_rows, d_points);
         return;
     }
     for (size_t c = 0; c < (half ? half : (size_t)DISTI_BLOCK); c++) {
@@ -6396,8 +6397,9 @@ static size_t disti_place_of(const dist_net *net, int l, size_t k)
 }
 
 /* Layer l's input x to (B, stride), the file's units side by side. A cache line of each column is filled at a time. */
-static void disti_transpose(const dist_net *net, const disti_kernels *kernels, int l, const float *x, float *xt)
+static void disti_transpose(const dist_shape *shape, int l, const float *x, float *xt)
 {
+    const dist_net *net = shape->net;
     enum { LINE = 16 };
     const disti_linear *layer = &net->layer[l];
     size_t stride = disti_store_stride(layer), rows = (size_t)(layer->prev + layer->point);
@@ -6405,7 +6407,7 @@ static void disti_transpose(const dist_net *net, const disti_kernels *kernels, i
         const float *from[LINE];
         size_t count = DISTI_MIN(rows - first, (size_t)LINE);
         for (size_t k = 0; k < count; k++) from[k] = x + disti_place_of(net, l, first + k) * DISTI_BLOCK;
-        if (count == LINE) kernels->transpose(from, layer->scale, xt + first, stride);
+        if (count == LINE) shape->kernels.transpose(from, layer->scale, xt + first, stride);
         for (size_t c = 0; c < DISTI_BLOCK && count < LINE; c++)
             for (size_t k = 0; k < count; k++) xt[c * stride + first + k] = layer->scale * from[k][c];
     }
@@ -6413,8 +6415,7 @@ static void disti_transpose(const dist_net *net, const disti_kernels *kernels, i
 
 /* The rest of hidden layer l where lanes are values and tangents: W x in y becomes phi(norm(W x + b)) and, along the
    direction, its derivative phi'(a) a'. slope keeps phi'(a) and, in the tangent's lane, phi''(a) a'. */
-static void disti_hidden_tangents(const dist_shape *shape, const disti_kernels *kernels, const disti_block *b, int l,
-                                  float *y)
+static void disti_hidden_tangents(const dist_shape *shape, const disti_block *b, int l, float *y)
 {
     const dist_net *net = shape->net;
     const disti_linear *layer = &net->layer[l];
@@ -6425,16 +6426,15 @@ static void disti_hidden_tangents(const dist_shape *shape, const disti_kernels *
         for (size_t c = 0; c < DISTI_BLOCK / 2; c++) y[u * DISTI_BLOCK + c] += add;
     }
     if (net->normed)
-        kernels->norm_tangents(layer->out, net->norm_epsilon, net->params + layer->norm_weight,
-                               net->params + layer->norm_bias, y, b->hat + at * DISTI_BLOCK,
-                               b->inverse + (size_t)l * DISTI_BLOCK);
-    kernels->activate_tangents(net->activation, l == 0 ? net->first_scale : net->scale, out, y,
-                               b->slope ? b->slope + at * DISTI_BLOCK : NULL, b->mask + at + width);
+        shape->kernels.norm_tangents(layer->out, net->norm_epsilon, net->params + layer->norm_weight,
+                                     net->params + layer->norm_bias, y, b->hat + at * DISTI_BLOCK,
+                                     b->inverse + (size_t)l * DISTI_BLOCK);
+    shape->kernels.activate_tangents(net->activation, l == 0 ? net->first_scale : net->scale, out, y,
+                                     b->slope ? b->slope + at * DISTI_BLOCK : NULL, b->mask + at + width);
 }
 
 /* Hidden layer l: x to the input of layer l + 1 in y, with everything that its adjoint reads. */
-static void disti_hidden(const dist_shape *shape, const disti_kernels *kernels, disti_block *b, int l, const float *x,
-                         float *y)
+static void disti_hidden(const dist_shape *shape, disti_block *b, int l, const float *x, float *y)
 {
     const dist_net *net = shape->net;
     const disti_linear *layer = &net->layer[l];
@@ -6444,7 +6444,7 @@ static void disti_hidden(const dist_shape *shape, const disti_kernels *kernels, 
     int plain = net->activation == DIST_ACTIVATION_RELU && !net->normed && !b->half;
     if (disti_use_blas(shape, l)) {
         disti_linear_blas(shape, l, bias, DISTI_BLOCK, DISTI_BLOCK, x, x + (size_t)layer->prev * DISTI_BLOCK, y);
-        if (plain) kernels->relu(out, y, mask);
+        if (plain) shape->kernels.relu(out, y, mask);
     } else {
         disti_gemm g;
         g.weights = net->panels + layer->panel;
@@ -6458,13 +6458,14 @@ static void disti_hidden(const dist_shape *shape, const disti_kernels *kernels, 
         g.relu = plain;
         g.out = layer->out;
         g.columns = b->columns;
-        kernels->gemm(&g);
+        shape->kernels.gemm(&g);
     }
     if (net->normed && !b->half)
-        kernels->norm(layer->out, net->norm_epsilon, net->params + layer->norm_weight, net->params + layer->norm_bias,
-                      y, b->hat + (size_t)l * width * DISTI_BLOCK, b->inverse + (size_t)l * DISTI_BLOCK);
+        shape->kernels.norm(layer->out, net->norm_epsilon, net->params + layer->norm_weight,
+                            net->params + layer->norm_bias, y, b->hat + (size_t)l * width * DISTI_BLOCK,
+                            b->inverse + (size_t)l * DISTI_BLOCK);
     if (b->half) {
-        disti_hidden_tangents(shape, kernels, b, l, y);
+        disti_hidden_tangents(shape, b, l, y);
     } else if (net->activation != DIST_ACTIVATION_RELU) {
         float *slope = b->values ? NULL : b->slope + (size_t)l * width * DISTI_BLOCK;
         float scale = l == 0 ? net->first_scale : net->scale;
@@ -6474,9 +6475,9 @@ static void disti_hidden(const dist_shape *shape, const disti_kernels *kernels, 
             n = 1;
         }
         for (size_t i = 0; i < n * DISTI_BLOCK; i += DISTI_BLOCK)
-            kernels->activate(net->activation, scale, lanes, y + i, slope ? slope + i : NULL);
+            shape->kernels.activate(net->activation, scale, lanes, y + i, slope ? slope + i : NULL);
     } else if (!plain) {
-        kernels->relu(out, y, mask);
+        shape->kernels.relu(out, y, mask);
         for (size_t u = 0; b->columns < DISTI_BLOCK && u < out; u++) /* the others hold what was there before */
             mask[u] &= ((uint64_t)1 << b->columns) - 1;
     }
@@ -6496,14 +6497,35 @@ static const float *disti_net_forward(const dist_shape *shape, disti_block *b, f
     for (int l = 0; l < net->layers; l++) {
         const disti_linear *layer = &net->layer[l];
         if (store)
-            disti_transpose(net, &b->kernels, l, x, store + disti_store_offset(net, l, DISTI_STORE_INPUT));
+            disti_transpose(shape, l, x, store + disti_store_offset(net, l, DISTI_STORE_INPUT));
         done += (double)b->alive_count[l] * layer->out;
         if (l + 1 == net->layers) break;
-        disti_hidden(shape, &b->kernels, b, l, x, b->act[l & 1]);
+        disti_hidden(shape, b, l, x, b->act[l & 1]);
         x = b->act[l & 1];
     }
     counter->done += done * b->columns;
     return x;
+}
+
+/* v less the level to value, but where value, the layer's sum, is not finite: that is what the ray is told. */
+DISTI_LOOPS static void disti_output_values(size_t count, float level, const float *DISTI_RESTRICT v,
+                                            float *DISTI_RESTRICT value)
+{
+    for (size_t c = 0; c < count; c++) {
+        const float moved = v[c] - level;
+        value[c] = disti_finite(value[c]) ? moved : value[c];
+    }
+}
+
+/* There the slope and the curvature are 0. */
+DISTI_LOOPS static void disti_output_slopes(size_t count, const float *DISTI_RESTRICT sum, float *DISTI_RESTRICT d,
+                                            float *DISTI_RESTRICT bend)
+{
+    for (size_t c = 0; c < count; c++) {
+        const float slope = d[c], curvature = bend[c];
+        d[c] = disti_finite(sum[c]) ? slope : 0.0f;
+        bend[c] = disti_finite(sum[c]) ? curvature : 0.0f;
+    }
 }
 
 /* Channel `channel` of the last layer to b->value after the output function, its slope and its curvature. Tangents'
@@ -6518,45 +6540,37 @@ static void disti_net_output(const dist_shape *shape, const disti_block *b, cons
     const int *alive = b->alive_count[l] < rows ? b->alive + (size_t)l * (size_t)net->max_rows : NULL;
     float bias = shape->bias[(size_t)l * (size_t)net->max_rows + (size_t)channel];
     const float *w = net->panels + layer->panel + (size_t)channel * (size_t)rows;
-    b->kernels.dot(w, b->half ? 0.0f : bias, x, alive, b->alive_count[l], rows, b->columns, value);
-    float v[DISTI_BLOCK], d[DISTI_BLOCK], t[DISTI_BLOCK], bend[DISTI_BLOCK];
-    float level = channel == net->sdf_channel ? net->level : 0.0f;
+    shape->kernels.dot(w, b->half ? 0.0f : bias, x, alive, b->alive_count[l], rows, b->columns, value);
+    float v[DISTI_BLOCK], t[DISTI_BLOCK], *d = b->value_slope, *bend = b->value_curvature;
     int twice = net->output == DISTI_OUTPUT_TANH_TWICE;
     size_t count = b->half ? (size_t)b->half : (size_t)DISTI_BLOCK;
     memcpy(v, value, sizeof v);
     for (size_t c = 0; c < DISTI_BLOCK && b->half; c++) v[c] += bias;
-    for (size_t c = 0; c < DISTI_BLOCK; c++) d[c] = 1.0f;
-    memset(bend, 0, sizeof bend);
+    for (size_t c = 0; c < DISTI_BLOCK && !b->values; c++) d[c] = 1.0f, bend[c] = 0.0f;
     for (int k = 0; k < twice + (twice || net->output == DISTI_OUTPUT_TANH); k++) {
-        b->kernels.activate(DIST_ACTIVATION_TANH, 1.0f, DISTI_BLOCK, v, b->values ? NULL : t);
+        shape->kernels.activate(DIST_ACTIVATION_TANH, 1.0f, DISTI_BLOCK, v, b->values ? NULL : t);
         for (size_t c = 0; c < count && b->half; c++)
             bend[c] = t[c] * (bend[c] - 2.0f * v[c] * d[c] * d[c]); /* of t(v): t'' v'^2 + t' v'' */
-        if (b->values) continue;
-        for (size_t c = 0; c < DISTI_BLOCK; c++) d[c] *= t[c];
+        for (size_t c = 0; c < DISTI_BLOCK && !b->values; c++) d[c] *= t[c];
     }
     for (size_t c = 0; c < count && net->output == DISTI_OUTPUT_SIGMOID; c++) {
-        d[c] = disti_sigmoid_slope(v[c]);
+        float slope = disti_sigmoid_slope(v[c]);
         v[c] = disti_sigmoid(v[c]);
-        bend[c] = d[c] * (1.0f - 2.0f * v[c]);
+        if (!b->values) d[c] = slope, bend[c] = slope * (1.0f - 2.0f * v[c]);
     }
-    for (size_t c = 0; c < count; c++) {
-        if (disti_finite(value[c])) value[c] = v[c] - level;
-        else d[c] = bend[c] = 0.0f; /* and value stays what it is: the ray is told */
-    }
-    if (b->values) return;
-    memcpy(b->value_slope, d, sizeof d);
-    memcpy(b->value_curvature, bend, sizeof bend);
+    if (!b->values) disti_output_slopes(count, value, d, bend);
+    disti_output_values(count, channel == net->sdf_channel ? net->level : 0.0f, v, value);
 }
 
 /* delta of layer l's output (after the activation) to that of its pre-activation, in place. ReLU's mask is in it
    already. sums, unless NULL, gets what gamma and beta receive: sum_c delta hat, sum_c delta. */
-static void disti_hidden_delta(const dist_net *net, const disti_kernels *kernels, const disti_block *b, int l,
-                               float *delta, float *sums)
+static void disti_hidden_delta(const dist_shape *shape, const disti_block *b, int l, float *delta, float *sums)
 {
+    const dist_net *net = shape->net;
     const disti_linear *layer = &net->layer[l];
     size_t width = (size_t)net->max_rows, out = (size_t)layer->out;
     if (net->activation == DIST_ACTIVATION_RELU && !net->normed) return;
-    if (b->slope) kernels->activate_back(out, (size_t)b->half, b->slope + (size_t)l * width * DISTI_BLOCK, delta);
+    if (b->slope) shape->kernels.activate_back(out, (size_t)b->half, b->slope + (size_t)l * width * DISTI_BLOCK, delta);
     if (net->normed) {
         const uint64_t *mask = b->mask + (size_t)(l + 1) * width; /* rows that are not alive were not written */
         if (net->activation == DIST_ACTIVATION_RELU)
@@ -6571,14 +6585,13 @@ static void disti_hidden_delta(const dist_net *net, const disti_kernels *kernels
                     sums[disti_store_out(layer) + u] += delta[u * DISTI_BLOCK + c];
             }
         }
-        kernels->norm_back(layer->out, net->params + layer->norm_weight, (size_t)b->half, hat,
-                           b->inverse + (size_t)l * DISTI_BLOCK, delta);
+        shape->kernels.norm_back(layer->out, net->params + layer->norm_weight, (size_t)b->half, hat,
+                                b->inverse + (size_t)l * DISTI_BLOCK, delta);
     }
 }
 
 /* delta of layer l's pre-activation to its input rows d_x: W^T delta, masked. */
-static void disti_linear_backward(const dist_shape *shape, const disti_kernels *kernels, const disti_block *b, int l,
-                                  float *delta, float *d_x)
+static void disti_linear_backward(const dist_shape *shape, const disti_block *b, int l, float *delta, float *d_x)
 {
     const dist_net *net = shape->net;
     const disti_linear *layer = &net->layer[l];
@@ -6617,7 +6630,7 @@ static void disti_linear_backward(const dist_shape *shape, const disti_kernels *
     int sparse = relu && !net->normed && b->alive_units[l + 1] < layer->out;
     g.alive_out = sparse ? b->alive + (size_t)(l + 1) * width : NULL;
     g.alive_out_count = b->alive_units[l + 1];
-    kernels->gemm_back(&g);
+    shape->kernels.gemm_back(&g);
 }
 
 static void disti_add_point_rows(const disti_linear *layer, const float *DISTI_RESTRICT d_x,
@@ -6641,8 +6654,7 @@ static void disti_keep_delta(const dist_net *net, const disti_block *b, int l, c
 }
 
 /* delta of the last layer's input: sum over the channels of W_k^T seed_k, masked. */
-static void disti_output_backward(const dist_shape *shape, const disti_kernels *kernels, const disti_block *b,
-                                  const float *seed, float *delta)
+static void disti_output_backward(const dist_shape *shape, const disti_block *b, const float *seed, float *delta)
 {
     const dist_net *net = shape->net;
     int last = net->layers - 1, rows = net->layer[last].prev + net->layer[last].point, count = b->alive_count[last];
@@ -6650,10 +6662,10 @@ static void disti_output_backward(const dist_shape *shape, const disti_kernels *
     const int *alive = count < rows ? b->alive + at : NULL;
     const uint64_t *mask = net->activation == DIST_ACTIVATION_RELU ? b->mask + at : NULL;
     const float *w = net->panels + net->layer[last].panel + (size_t)b->channel * (size_t)rows;
-    kernels->outer(w, seed, alive, count, rows, b->columns, mask, delta);
+    shape->kernels.outer(w, seed, alive, count, rows, b->columns, mask, delta);
     for (int k = 1; k < b->channels; k++) {
         float *more = b->delta[(last + 1) & 1];
-        kernels->outer(w + k * rows, seed + k * DISTI_BLOCK, alive, count, rows, b->columns, mask, more);
+        shape->kernels.outer(w + k * rows, seed + k * DISTI_BLOCK, alive, count, rows, b->columns, mask, more);
         for (int i = 0; i < count; i++) {
             size_t row = (size_t)(alive ? alive[i] : i) * DISTI_BLOCK;
             for (size_t c = 0; c < (size_t)b->columns; c++) delta[row + c] += more[row + c];
@@ -6681,15 +6693,15 @@ static void disti_net_reverse(const dist_shape *shape, disti_block *b, const flo
     if (store) memcpy(store + disti_store_offset(net, last, DISTI_STORE_DELTA), seed, seeds);
     if (layer->code) memcpy(disti_delta_room(net, b, last, &fold), seed, seeds);
     float *delta = disti_delta_room(net, b, last - 1, &fold);
-    disti_output_backward(shape, &b->kernels, b, seed, delta);
+    disti_output_backward(shape, b, seed, delta);
     disti_add_point_rows(layer, delta, b->d_point);
     for (int l = last - 1; l >= 0; l--) {
         layer = &net->layer[l];
-        disti_hidden_delta(net, &b->kernels, b, l, delta,
+        disti_hidden_delta(shape, b, l, delta,
                            store ? store + disti_store_offset(net, l, DISTI_STORE_NORM) : NULL);
         if (store) disti_keep_delta(net, b, l, delta, store + disti_store_offset(net, l, DISTI_STORE_DELTA));
         float *d_x = disti_delta_room(net, b, l - 1, &fold);
-        disti_linear_backward(shape, &b->kernels, b, l, delta, d_x);
+        disti_linear_backward(shape, b, l, delta, d_x);
         disti_add_point_rows(layer, d_x, b->d_point);
         delta = d_x;
     }
@@ -6699,7 +6711,6 @@ static void disti_net_reverse(const dist_shape *shape, disti_block *b, const flo
 static void disti_blocks_begin(const dist_shape *shape, int worker, disti_block *b, size_t n)
 {
     disti_block_layout(shape->net, disti_lane(shape->ctx, worker), b);
-    b->kernels = disti_kernels_for(shape->ctx->isa);
     disti_counter_of(shape->ctx, worker)->dense += (double)dist_net_operations(shape->net, 1) * (double)n;
 }
 
@@ -6709,7 +6720,7 @@ static void disti_block_load(const dist_shape *shape, disti_block *b, size_t n, 
     b->columns = (int)n;
     b->channel = shape->net->sdf_channel;
     b->channels = 1;
-    disti_encode(shape->net, &b->kernels, n, points, b->point);
+    disti_encode(shape->net, &shape->kernels, n, points, b->point);
 }
 
 static void disti_block_begin(const dist_shape *shape, int worker, disti_block *b, size_t n, const float *points)
@@ -6757,7 +6768,7 @@ static void disti_fold_backward(const dist_shape *shape, disti_block *b, size_t 
             size_t unit = l + 1 == net->layers ? o + row : disti_unit(net, l, o);
             const float *w = net->params + layer->weight + unit * (size_t)layer->in + layer->code_column;
             double s = sum[o] * (double)layer->scale;
-            if (s != 0.0) b->kernels.axpy(count, s, w + first, d_code);
+            if (s != 0.0) shape->kernels.axpy(count, s, w + first, d_code);
         }
     }
 }
@@ -6775,19 +6786,20 @@ static void disti_fold_sum(const dist_shape *shape, disti_block *b, const float 
         if (!layer->code) continue;
         int last = l + 1 == net->layers, rows = last ? b->channels : layer->out;
         int listed = !last && sparse && b->alive_units[l + 1] < rows;
-        b->kernels.lanes(seed ? seed : ones, b->fold_delta + fold * width * DISTI_BLOCK,
-                      listed ? b->alive + (size_t)(l + 1) * width : NULL, listed ? b->alive_units[l + 1] : rows, rows,
-                      b->columns - b->half, b->fold_lanes + fold * width * 16);
+        shape->kernels.lanes(seed ? seed : ones, b->fold_delta + fold * width * DISTI_BLOCK,
+                             listed ? b->alive + (size_t)(l + 1) * width : NULL,
+                             listed ? b->alive_units[l + 1] : rows, rows, b->columns - b->half,
+                             b->fold_lanes + fold * width * 16);
         fold++;
     }
     if (index % 16 == 15) disti_fold_flush(net, b);
 }
 
 /* Whether few points go through kernels.few. */
-static int disti_net_few(const dist_shape *shape, const disti_block *b, size_t n)
+static int disti_net_few(const dist_shape *shape, size_t n)
 {
     const dist_net *net = shape->net;
-    return n <= (size_t)b->kernels.few_points && net->activation == DIST_ACTIVATION_RELU && !net->normed &&
+    return n <= (size_t)shape->kernels.few_points && net->activation == DIST_ACTIVATION_RELU && !net->normed &&
            net->layers > 1 && !shape->ctx->blas.sgemm_fn;
 }
 
@@ -6795,9 +6807,9 @@ static int disti_net_few(const dist_shape *shape, const disti_block *b, size_t n
    them of few points, where a layer is long enough to pay for a second pass over it. */
 static size_t disti_net_part(const dist_shape *shape, const disti_block *b, size_t n)
 {
-    const disti_part *part = b->kernels.parts;
+    const disti_part *part = shape->kernels.parts;
     size_t block = DISTI_MIN(n, (size_t)DISTI_BLOCK);
-    if (!part || !b->values || !shape->wide || !disti_net_few(shape, b, (size_t)b->kernels.few_points)) return block;
+    if (!part || !b->values || !shape->wide || !disti_net_few(shape, (size_t)shape->kernels.few_points)) return block;
     while (part->least && n > (size_t)part->most) part++;
     return part->least && n >= (size_t)part->least ? (size_t)part->points : block;
 }
@@ -6845,7 +6857,7 @@ static const float *disti_few_forward(const dist_shape *shape, disti_block *b, d
         few.count = count;
         few.out = layer->out;
         few.points = b->columns;
-        b->kernels.few(&few);
+        shape->kernels.few(&few);
     }
     counter->done += done * b->columns;
     const float *x = b->act[last & 1];
@@ -6966,8 +6978,7 @@ static void disti_group_begin(disti_group *g, int n, const float *points)
 
 /* Layer l's input of block j, of which `units` rows listed in g->unit were computed: the list of the alive ones, then
    the point's, which it writes, and their model, where a layer follows whose units are bounded by it. */
-static void disti_group_input(const dist_shape *shape, const disti_kernels *kernels, disti_group *g, int l, int j,
-                              int units, float slack)
+static void disti_group_input(const dist_shape *shape, disti_group *g, int l, int j, int units, float slack)
 {
     const dist_net *net = shape->net;
     const disti_linear *layer = &net->layer[l];
@@ -6993,7 +7004,7 @@ static void disti_group_input(const dist_shape *shape, const disti_kernels *kern
     fit.slack = slack;
     fit.count = count;
     fit.columns = (g->count[j] + 15) / 16 * 16;
-    if (l + 1 < net->layers) kernels->fit(&fit);
+    if (l + 1 < net->layers) shape->kernels.fit(&fit);
     g->alive_units[j][l] = count;
     for (int i = 0; i < layer->point; i++, count++) {
         float *m = model + (size_t)count * 8, c = g->center[j][i];
@@ -7008,8 +7019,7 @@ static void disti_group_input(const dist_shape *shape, const disti_kernels *kern
 }
 
 /* All hidden layers of a group of n points; disti_group_block then gives its blocks. Returns the multiply-adds. */
-static double disti_group_forward(const dist_shape *shape, const disti_kernels *kernels, disti_group *g, int n,
-                                  const float *points)
+static double disti_group_forward(const dist_shape *shape, disti_group *g, int n, const float *points)
 {
     const dist_net *net = shape->net;
     int last = net->layers - 1, count[DISTI_GROUP];
@@ -7017,7 +7027,7 @@ static double disti_group_forward(const dist_shape *shape, const disti_kernels *
     double done = 0.0;
     size_t width = (size_t)net->max_rows, all = (size_t)net->layers * width;
     disti_group_begin(g, n, points);
-    for (int j = 0; j < g->blocks; j++) disti_group_input(shape, kernels, g, 0, j, 0, slack);
+    for (int j = 0; j < g->blocks; j++) disti_group_input(shape, g, 0, j, 0, slack);
     for (int l = 0; l < last; l++) {
         const disti_linear *layer = &net->layer[l];
         const float *bias = shape->bias + (size_t)l * width;
@@ -7033,13 +7043,13 @@ static double disti_group_forward(const dist_shape *shape, const disti_kernels *
         bound.rows = layer->prev + layer->point;
         bound.out = layer->out;
         bound.blocks = g->blocks;
-        kernels->bound(&bound);
+        shape->kernels.bound(&bound);
         for (int j = 0; j < g->blocks; j++) {
             size_t block = (size_t)j * width, at = (size_t)j * all + (size_t)l * width;
             const int *live = g->live;
             int units = 0, out = layer->out, *unit = g->unit;
             disti_gemm m;
-            kernels->live((size_t)out, g->sum + 5 * block, width, bias, slack, g->cell[j], g->live);
+            shape->kernels.live((size_t)out, g->sum + 5 * block, width, bias, slack, g->cell[j], g->live);
             for (int o = 0; o < out; o++) {
                 unit[units] = o;
                 units += live[o];
@@ -7055,9 +7065,9 @@ static double disti_group_forward(const dist_shape *shape, const disti_kernels *
             m.out = out;
             m.columns = (g->count[j] + 15) / 16 * 16;
             m.relu = 1;
-            kernels->gemm_some(&m, unit, units);
+            shape->kernels.gemm_some(&m, unit, units);
             done += (double)count[j] * (5.0 * (double)layer->out + (double)units * (double)g->count[j]);
-            disti_group_input(shape, kernels, g, l + 1, j, units, slack);
+            disti_group_input(shape, g, l + 1, j, units, slack);
         }
     }
     for (int j = 0; j < g->blocks; j++) done += (double)g->alive_count[j][last] * (double)g->count[j];
@@ -7088,7 +7098,7 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
     const dist_shape *shape = (const dist_shape *)user;
     const dist_net *net = shape->net;
     disti_counter *counter = disti_counter_of(shape->ctx, worker);
-    disti_block own, b;
+    disti_block own, b, *block; /* b: of a group */
     disti_group g;
     int blocks = 0, j = 0;
     disti_blocks_begin(shape, worker, &own, n);
@@ -7105,7 +7115,7 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
         int part = (int)DISTI_MIN(n - at, (size_t)DISTI_GROUP_POINTS);
         if (j == blocks && shape->groups > own.values && n - at >= DISTI_GROUP_LEAST &&
             disti_finite_all(3 * (size_t)part, points + 3 * at)) { /* no bound around a point that is not */
-            counter->done += disti_group_forward(shape, &own.kernels, &g, part, points + 3 * at);
+            counter->done += disti_group_forward(shape, &g, part, points + 3 * at);
             blocks = g.blocks;
             for (j = 0; j < blocks; j++) { /* all, before a reverse pass takes the memory of their inputs */
                 b = own;
@@ -7114,24 +7124,26 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
             }
             j = 0;
         }
-        b = own;
+        block = &own;
         if (j < blocks) {
-            disti_group_block(net, &g, j, &b);
+            b = own;
+            block = &b;
+            disti_group_block(net, &g, j, block);
         } else {
-            count = disti_net_part(shape, &b, n - at);
-            disti_block_load(shape, &b, count, points + 3 * at);
-            const float *x = disti_net_few(shape, &b, count) ? disti_few_forward(shape, &b, counter)
-                                                             : disti_net_forward(shape, &b, NULL, counter);
-            disti_net_output(shape, &b, x, net->sdf_channel);
+            count = disti_net_part(shape, block, n - at);
+            disti_block_load(shape, block, count, points + 3 * at);
+            const float *x = disti_net_few(shape, count) ? disti_few_forward(shape, block, counter)
+                                                         : disti_net_forward(shape, block, NULL, counter);
+            disti_net_output(shape, block, x, net->sdf_channel);
         }
-        if (sdf) memcpy(sdf + at, b.value, count * sizeof(float));
-        if (b.values) continue;
-        disti_net_reverse(shape, &b, b.value_slope, NULL);
-        disti_encode_backward(net, &b, b.pull);
-        if (gradient) memcpy(gradient + 3 * at, b.pull, 3 * count * sizeof(float));
+        if (sdf) memcpy(sdf + at, block->value, count * sizeof(float));
+        if (own.values) continue;
+        disti_net_reverse(shape, block, block->value_slope, NULL);
+        disti_encode_backward(shape, block, own.pull);
+        if (gradient) memcpy(gradient + 3 * at, own.pull, 3 * count * sizeof(float));
         if (!seed_fn) continue;
-        seed_fn(seed_user, at, count, b.value, b.pull, b.seed);
-        if (d_code) disti_fold_sum(shape, &b, b.seed, at / DISTI_BLOCK);
+        seed_fn(seed_user, at, count, block->value, own.pull, own.seed);
+        if (d_code) disti_fold_sum(shape, block, own.seed, at / DISTI_BLOCK);
     }
     if (d_code) disti_fold_backward(shape, &own, 0, (size_t)net->code_size, d_code);
 }
@@ -7174,7 +7186,7 @@ static void disti_second_block(const dist_shape *shape, int worker, disti_block 
         b->seed[DISTI_BLOCK / 2 + c] = b->value_slope[c];
     }
     disti_net_reverse(shape, b, b->seed, store);
-    disti_encode_backward(net, b, b->pull);
+    disti_encode_backward(shape, b, b->pull);
 }
 
 /* dist_field.second_fn of a net. */
@@ -7209,8 +7221,7 @@ static size_t disti_wide_floats(const dist_context *ctx, const dist_net *net)
 }
 
 /* Hidden layer l by the BLAS: y = activation(W x + W_point point + bias), rows of DISTI_WIDE_COLUMNS. */
-static void disti_wide_hidden(const dist_shape *shape, const disti_kernels *kernels, int l, int columns, const float *x,
-                              const float *point, float *y)
+static void disti_wide_hidden(const dist_shape *shape, int l, int columns, const float *x, const float *point, float *y)
 {
     const dist_net *net = shape->net;
     uint64_t mask[DISTI_WIDE];
@@ -7218,8 +7229,8 @@ static void disti_wide_hidden(const dist_shape *shape, const disti_kernels *kern
                       y);
     for (size_t o = 0; o < (size_t)net->layer[l].out; o++) {
         float *row = y + o * DISTI_WIDE_COLUMNS;
-        if (net->activation == DIST_ACTIVATION_RELU) kernels->relu((size_t)(columns / DISTI_BLOCK), row, mask);
-        else kernels->activate(net->activation, net->scale, (size_t)columns, row, NULL);
+        if (net->activation == DIST_ACTIVATION_RELU) shape->kernels.relu((size_t)(columns / DISTI_BLOCK), row, mask);
+        else shape->kernels.activate(net->activation, net->scale, (size_t)columns, row, NULL);
     }
 }
 
@@ -7233,7 +7244,6 @@ static void disti_wide_eval(const dist_shape *shape, int worker, size_t n, const
 {
     const dist_net *net = shape->net;
     const disti_linear *last = &net->layer[net->layers - 1];
-    disti_kernels kernels = disti_kernels_for(shape->ctx->isa);
     disti_block b;
     size_t bytes = disti_block_layout(net, NULL, &b), stride = DISTI_WIDE_COLUMNS;
     float *point = (float *)(void *)(disti_lane(shape->ctx, worker) + bytes);
@@ -7247,12 +7257,12 @@ static void disti_wide_eval(const dist_shape *shape, int worker, size_t n, const
             disti_block_begin(shape, worker, &b, DISTI_MIN(n - first, (size_t)DISTI_BLOCK), points + 3 * first);
             b.columns = DISTI_BLOCK;
             disti_list_alive(shape, &b, 0);
-            disti_hidden(shape, &kernels, &b, 0, b.point, b.act[0]);
+            disti_hidden(shape, &b, 0, b.point, b.act[0]);
             disti_copy_rows((size_t)net->layer[0].out, b.act[0], DISTI_BLOCK, wide[0] + j * DISTI_BLOCK, stride);
             disti_copy_rows((size_t)net->point_size, b.point, DISTI_BLOCK, point + j * DISTI_BLOCK, stride);
         }
         for (int l = 1; l + 1 < net->layers; l++)
-            disti_wide_hidden(shape, &kernels, l, (int)(blocks * DISTI_BLOCK), wide[(l - 1) & 1], point, wide[l & 1]);
+            disti_wide_hidden(shape, l, (int)(blocks * DISTI_BLOCK), wide[(l - 1) & 1], point, wide[l & 1]);
         for (size_t j = 0; j < blocks; j++) {
             size_t first = at + j * DISTI_BLOCK;
             b.alive_count[net->layers - 1] = last->prev + last->point;
@@ -7366,8 +7376,7 @@ static void disti_shape_eval_fn(void *user, int worker, size_t n, const float *p
 
 #ifdef DISTI_HALF
 /* Hidden layer l of 96 points (f16) or 48 (bf16), x to y. */
-static void disti_half_hidden(const dist_shape *shape, const disti_kernels *kernels, const disti_block *b, int l,
-                              disti_half *h)
+static void disti_half_hidden(const dist_shape *shape, const disti_block *b, int l, disti_half *h)
 {
     const dist_net *net = shape->net;
     const disti_linear *layer = &net->layer[l];
@@ -7387,7 +7396,7 @@ static void disti_half_hidden(const dist_shape *shape, const disti_kernels *kern
     h->y_alive_count = 0;
     h->last[0] = last ? b->delta[0] : NULL;
     h->last[1] = last ? b->delta[1] : NULL;
-    h->activate = net->activation == DIST_ACTIVATION_RELU ? NULL : kernels->activate;
+    h->activate = net->activation == DIST_ACTIVATION_RELU ? NULL : shape->kernels.activate;
     h->activation = net->activation;
     h->scale = l == 0 ? net->first_scale : net->scale;
     h->out = layer->out;
@@ -7401,7 +7410,6 @@ static void disti_shape_coarse(void *user, int worker, size_t n, const float *po
     const dist_shape *shape = (const dist_shape *)user;
     const dist_net *net = shape->net;
     const disti_linear *last = &net->layer[net->layers - 1];
-    disti_kernels kernels = disti_kernels_for(shape->ctx->isa);
     size_t wide = net->half == DIST_HALF_F16 ? 2 * DISTI_BLOCK : DISTI_BLOCK;
     if (gradient || !net->half) {
         disti_shape_fused(user, worker, n, points, sdf, gradient, NULL, NULL, NULL);
@@ -7415,7 +7423,7 @@ static void disti_shape_coarse(void *user, int worker, size_t n, const float *po
         memset(&h, 0, sizeof h);
         disti_block_begin(shape, worker, &b, first, points + 3 * at);
         if (wide > DISTI_BLOCK) /* idle lanes repeat a point here too */
-            disti_encode(net, &kernels, count > first ? count - first : 1,
+            disti_encode(net, &shape->kernels, count > first ? count - first : 1,
                          points + 3 * (at + (count > first ? first : 0)), b.d_point);
         counter->dense += (double)dist_net_operations(net, 1) * (double)(count - first);
         h.points[0] = b.point;
@@ -7423,7 +7431,7 @@ static void disti_shape_coarse(void *user, int worker, size_t n, const float *po
         h.columns = (int)count;
         double done = (double)dist_net_operations(net, 1);
         for (int l = 0; l + 1 < net->layers; l++) {
-            disti_half_hidden(shape, &kernels, &b, l, &h);
+            disti_half_hidden(shape, &b, l, &h);
             /* whole numbers: sums of any order are the same */
             done -= (double)((h.steps - h.alive_count) * net->layer[l].prev / DISTI_MAX(h.steps, 1)) * h.out;
         }
@@ -7502,7 +7510,7 @@ static void disti_shape_color_adjoint_fn(void *user, int worker, size_t n, const
         size_t count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK);
         disti_block_begin(paint, worker, &b, count, points + 3 * at);
         disti_color_reverse(paint, worker, &b, count, d_color + 3 * at, NULL);
-        if (d_points) disti_encode_backward(net, &b, b.pull);
+        if (d_points) disti_encode_backward(paint, &b, b.pull);
         for (size_t i = 0; d_points && i < 3 * count; i++) d_points[3 * at + i] += b.pull[i];
         if (d_code || d_color_code) disti_fold_sum(paint, &b, NULL, at / DISTI_BLOCK);
     }
@@ -7545,9 +7553,9 @@ static disti_weights_job disti_weights_begin(const dist_shape *shape, size_t n, 
 }
 
 /* Whether a number of a block's store is so large that products with others may overflow. */
-static int disti_weights_huge(const dist_net *net, const disti_kernels *kernels, size_t columns, size_t channels,
-                              const float *store)
+static int disti_weights_huge(const dist_shape *shape, size_t columns, size_t channels, const float *store)
 {
+    const dist_net *net = shape->net;
     int huge = 0;
     for (int l = 0; l < net->layers && !huge; l++) {
         const disti_linear *layer = &net->layer[l];
@@ -7555,8 +7563,9 @@ static int disti_weights_huge(const dist_net *net, const disti_kernels *kernels,
         const float *input = store + disti_store_offset(net, l, DISTI_STORE_INPUT);
         const float *delta = store + disti_store_offset(net, l, DISTI_STORE_DELTA);
         const float *norm = store + disti_store_offset(net, l, DISTI_STORE_NORM);
-        huge = kernels->huge(columns * disti_store_stride(layer), input) || kernels->huge(rows * DISTI_BLOCK, delta) ||
-               kernels->huge(net->normed ? 2 * disti_store_out(layer) : 0, norm);
+        huge = shape->kernels.huge(columns * disti_store_stride(layer), input) ||
+               shape->kernels.huge(rows * DISTI_BLOCK, delta) ||
+               shape->kernels.huge(net->normed ? 2 * disti_store_out(layer) : 0, norm);
     }
     return huge;
 }
@@ -7619,10 +7628,10 @@ static void disti_weights_block(void *arg, int index, int worker)
             for (size_t c = 0; c < DISTI_BLOCK; c++) seed[c] = c < count ? seed[c] * b.value_slope[c] : 0.0f;
             disti_net_reverse(shape, &b, seed, store);
         }
-        disti_encode_backward(net, &b, b.pull);
+        disti_encode_backward(shape, &b, b.pull);
     }
     size_t columns = job->directions ? (size_t)DISTI_BLOCK : count, channels = job->d_color ? 3 : 1;
-    if (disti_weights_huge(net, &b.kernels, columns, channels, store))
+    if (disti_weights_huge(shape, columns, channels, store))
         disti_weights_drop(net, columns, channels, store);
     for (size_t i = 0; job->d_points && i < 3 * count; i++) job->d_points[3 * at + i] += b.pull[i];
     if (!job->d_code) return;
@@ -7641,8 +7650,7 @@ static int disti_weights_channel(const disti_weights_job *job)
 
 /* Adds one block's share to `count` rows of layer l from row `o`, counted from the job's channel in the last layer;
    but for the code's columns: total gets the sums of the rows' deltas. */
-static void disti_weights_rows(const disti_weights_job *job, const disti_kernels *kernels, int l, size_t o,
-                               size_t count, int index, double *total)
+static void disti_weights_rows(const disti_weights_job *job, int l, size_t o, size_t count, int index, double *total)
 {
     const dist_shape *shape = job->shape;
     const dist_net *net = shape->net;
@@ -7661,11 +7669,11 @@ static void disti_weights_rows(const disti_weights_job *job, const disti_kernels
     g.out = (int)count;
     g.rows = layer->prev;
     g.columns = job->directions ? DISTI_BLOCK : (int)values;
-    kernels->gemm_weights(&g);
+    shape->kernels.gemm_weights(&g);
     g.xt = xt + layer->prev;
     g.d_weights = w + layer->point_column;
     g.rows = layer->point;
-    kernels->gemm_weights(&g);
+    shape->kernels.gemm_weights(&g);
     for (size_t i = 0; i < 16; i++) ones[i] = 1.0f;
     memset(sum, 0, sizeof sum);
     g.xt = ones; /* for every column */
@@ -7674,7 +7682,7 @@ static void disti_weights_rows(const disti_weights_job *job, const disti_kernels
     g.stride = 1;
     g.rows = 1;
     g.columns = (int)values; /* tangents have no share in the bias */
-    kernels->gemm_weights(&g);
+    shape->kernels.gemm_weights(&g);
     for (size_t i = 0; i < count; i++) {
         job->d_weights[layer->bias + row + i] += sum[i];
         total[i] += (double)sum[i];
@@ -7692,7 +7700,6 @@ static void disti_weights_task(void *arg, int index, int worker)
     const disti_weights_job *job = (const disti_weights_job *)arg;
     const dist_shape *shape = job->shape;
     const dist_net *net = shape->net;
-    const disti_kernels kernels = disti_kernels_for(shape->ctx->isa);
     (void)worker;
     int l = 0;
     size_t o = (size_t)index * DISTI_WEIGHT_ROWS;
@@ -7707,7 +7714,7 @@ static void disti_weights_task(void *arg, int index, int worker)
     size_t row = l + 1 == net->layers ? (size_t)disti_weights_channel(job) : o;
     double total[DISTI_WEIGHT_ROWS];
     memset(total, 0, sizeof total);
-    for (int i = 0; i < job->blocks; i++) disti_weights_rows(job, &kernels, l, o, count, i, total);
+    for (int i = 0; i < job->blocks; i++) disti_weights_rows(job, l, o, count, i, total);
     for (size_t i = 0; i < count; i++) {
         float *to = job->d_weights + layer->weight + (row + i) * (size_t)layer->in + layer->code_column;
         for (size_t j = 0; j < (size_t)layer->code; j++)
@@ -7786,7 +7793,6 @@ static int disti_groups_pay(dist_shape *shape, const float *points)
     disti_block b;
     disti_group g;
     size_t bytes = disti_block_layout(shape->net, disti_lane(shape->ctx, 0), &b);
-    disti_kernels kernels = disti_kernels_for(shape->ctx->isa);
     disti_counter *counter = disti_counter_of(shape->ctx, 0), plain = *counter;
     double some = 0.0, more = 0.0;
     float sdf[DISTI_BLOCK];
@@ -7800,7 +7806,7 @@ static int disti_groups_pay(dist_shape *shape, const float *points)
             }
         }
         disti_shape_fused(shape, 0, DISTI_BLOCK, g.points, sdf, NULL, NULL, NULL, NULL);
-        some += disti_group_forward(shape, &kernels, &g, DISTI_BLOCK, g.points);
+        some += disti_group_forward(shape, &g, DISTI_BLOCK, g.points);
         for (int l = 0; l + 1 < shape->net->layers; l++) {
             double out = shape->net->layer[l].out;
             more += out * (2.5 * g.alive_count[0][l] + 256.0) + 1800.0 * g.alive_units[0][l + 1];
@@ -8027,6 +8033,7 @@ static dist_status disti_shape_take(dist_shape *shape)
     const dist_net *net = shape->net;
     disti_block b;
     disti_group g;
+    shape->kernels = disti_kernels_for(ctx->isa);
     shape->groups = disti_net_groups(ctx, net);
     shape->wide = dist_net_operations(net, 1) >= 100000;
     size_t bytes = disti_block_layout(net, NULL, &b);

@@ -10020,6 +10020,154 @@ static int disti_ray_predicted(const disti_tracer *tracer, disti_ray *ray, float
     return disti_ray_ask(ray, DISTI_PREDICT, ray->q + step);
 }
 
+/* The front is near the surface: is it hit? */
+static int disti_ray_arrive(const disti_tracer *tracer, disti_ray *ray)
+{
+    if (ray->fb < 0.0f && ray->b > ray->s) { /* what is near need not be what is at b */
+        if (!disti_ray_alone(tracer, ray, ray->s, ray->f, ray->b, ray->fb, 2e-3f)) return disti_ray_step(tracer, ray);
+        return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->b, ray->fb);
+    }
+    float epsilon = disti_ray_near(tracer, ray, ray->s);
+    ray->side = 0;
+    ray->moved = ray->slope < 0.0f; /* came down to here from farther out: from a, or where f was epsilon */
+    ray->b = ray->fa > 0.0f ? ray->a : ray->s;
+    ray->fb = ray->fa > 0.0f ? ray->fa : ray->f;
+    if (ray->moved && !(ray->fa > 0.0f)) {
+        ray->b += (epsilon - ray->f) / ray->slope;
+        ray->fb = epsilon;
+    }
+    ray->a = ray->s;
+    ray->fa = ray->f;
+    return disti_ray_feel(tracer, ray, epsilon);
+}
+
+/* On from a new front. */
+static int disti_ray_onward(const disti_tracer *tracer, disti_ray *ray)
+{
+    if (ray->f < disti_ray_near(tracer, ray, ray->s)) return disti_ray_arrive(tracer, ray);
+    if (ray->s >= ray->leave) return disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest * ray->sign, 0.0f);
+    return disti_ray_aims(tracer, ray, ray->f) ? disti_ray_aim(ray) : disti_ray_step(tracer, ray);
+}
+
+/* The first sample of a ray, or a second one before it. */
+static int disti_ray_first(const disti_tracer *tracer, disti_ray *ray, float f)
+{
+    float q = ray->q;
+    if (f < 0.0f && q <= ray->enter) return disti_ray_inside(tracer, ray, f);
+    if (f < 0.0f) { /* the cone came too far: the Lipschitz figure was too small here */
+        ray->b = q;
+        ray->fb = f;
+        ray->width = DISTI_MAX(1.5f * -f / tracer->lipschitz, disti_ray_epsilon(tracer, ray, q));
+        return disti_ray_ask(ray, DISTI_BACK, DISTI_MAX(q - ray->width, ray->enter));
+    }
+    ray->s = q;
+    ray->f = f;
+    ray->slope = ray->fa = 0.0f;
+    ray->known = 0;
+    if (ray->fb > 0.0f) { /* the second query */
+        ray->a = q;
+        ray->fa = f;
+        ray->s = ray->b;
+        ray->f = ray->fb;
+        ray->slope = (ray->f - f) / (ray->b - q);
+        ray->known = 1;
+        ray->fb = 0.0f;
+    } else if (f < disti_ray_near(tracer, ray, q) && q > ray->enter && !(ray->fb < 0.0f)) {
+        ray->b = q; /* cones or other rays' spheres led up to this: does f fall toward it? One looks from before */
+        ray->fb = DISTI_MAX(f, 1e-30f); /* 0: none */
+        return disti_ray_ask(ray, DISTI_FIRST, DISTI_MAX(q - 4.0f * disti_ray_near(tracer, ray, q), ray->enter));
+    }
+    return disti_ray_onward(tracer, ray);
+}
+
+/* A sample farther back than one in a solid. */
+static int disti_ray_backed(const disti_tracer *tracer, disti_ray *ray, float f)
+{
+    if (f >= 0.0f) return disti_ray_open_bracket(tracer, ray, ray->q, f, ray->b, ray->fb);
+    if (ray->q <= ray->enter) return disti_ray_inside(tracer, ray, f);
+    ray->b = ray->q;
+    ray->fb = f;
+    ray->width *= 1.6f;
+    return disti_ray_ask(ray, DISTI_BACK, DISTI_MAX(ray->q - ray->width, ray->enter));
+}
+
+/* A step of the sphere at the front alone, with ray->slope known. */
+static int disti_ray_retry(const disti_tracer *tracer, disti_ray *ray)
+{
+    float step = DISTI_MAX(disti_empty(tracer, ray->f), 4.8e-7f * tracer->field->radius);
+    return disti_ray_ask(ray, DISTI_MARCH, DISTI_MIN(ray->s + step, ray->leave));
+}
+
+/* df/ds between two samples; where f is clamped none is known, and none foretells a surface. */
+static float disti_ray_slope(const disti_tracer *tracer, float f, float next, float step)
+{
+    float clamp = tracer->field->clamp > 0.0f ? 0.98f * tracer->field->clamp : 3e38f, slope = (next - f) / step;
+    return f > clamp || next > clamp ? DISTI_MAX(slope, 0.0f) : slope;
+}
+
+/* The front moves to the sample at q, and on to one beyond it if nothing fits between. */
+static void disti_ray_move(const disti_tracer *tracer, disti_ray *ray, float f)
+{
+    float q = ray->q;
+    ray->a = ray->s;
+    ray->fa = ray->mode == DISTI_SKIP ? 0.0f : ray->f;
+    ray->slope = disti_ray_slope(tracer, ray->f, f, q - ray->s);
+    ray->s = q;
+    ray->f = f;
+    ray->known = 1;
+    if (ray->fb > 0.0f && ray->b > q && ray->b - q <= disti_empty(tracer, f) + disti_empty(tracer, ray->fb)) {
+        ray->slope = disti_ray_slope(tracer, f, ray->fb, ray->b - q);
+        ray->s = ray->b;
+        ray->f = ray->fb;
+        ray->fa = 0.0f;
+    }
+    if (ray->b <= q) ray->fb = 0.0f;
+}
+
+/* A step of the march from the front to q. */
+static int disti_ray_marched(const disti_tracer *tracer, disti_ray *ray, float f)
+{
+    float q = ray->q, radius = disti_empty(tracer, ray->f), step = q - ray->s;
+    if (ray->fb < 0.0f && f > 0.0f && q < ray->b && ++ray->side >= 3 && !tracer->how.certified &&
+        (ray->side >= 8 || disti_ray_alone(tracer, ray, q, f, ray->b, ray->fb, 2e-3f)))
+        return disti_ray_open_bracket(tracer, ray, q, f, ray->b, ray->fb);
+    float gap = step - radius - disti_empty(tracer, f < 0.0f ? -f : f); /* what neither sphere covers */
+    int back = ray->mode != DISTI_SKIP && step > 1.0001f * radius + 4.8e-7f * tracer->field->radius;
+    float off = f - (ray->f + ray->slope * step);
+    int foretold = ray->known && (off < 0.0f ? -off : off) < 0.5f * (off - f); /* as deep as expected */
+    float room = (foretold ? 2e-2f : 1e-3f) * tracer->field->radius;
+    if (tracer->how.certified) room = disti_ray_epsilon(tracer, ray, ray->s);
+    if (f <= 0.0f && !(back && gap > room)) return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, q, f);
+    if (back && (f <= 0.0f || (gap > 0.0f && !disti_ray_trusts(tracer, ray, f, step)))) {
+        float slope = (f - ray->f) / step; /* something may hide in the gap: back, and keep the far sample */
+        ray->slope = DISTI_MAX(slope, -tracer->lipschitz);
+        ray->known = 1;
+        if (f <= 0.0f || !(ray->fb < 0.0f)) {
+            ray->side = 0;
+            ray->b = q;
+            ray->fb = f;
+        }
+        return disti_ray_retry(tracer, ray);
+    }
+    if (disti_ray_doubts(tracer, ray, f, step)) { /* back to where the last step began, and keep where it ended */
+        ray->slope = (ray->f - ray->fa) / (ray->s - ray->a);
+        ray->b = ray->s;
+        ray->fb = ray->f;
+        ray->s = ray->a;
+        ray->f = ray->fa;
+        ray->fa = 0.0f;
+        return disti_ray_retry(tracer, ray);
+    }
+    disti_ray_creeps(tracer, ray, f, back && gap > 0.0f);
+    if (ray->fb < 0.0f) { /* a crossing lies before b: is there room for another before it? */
+        if (ray->b <= q) return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->b, ray->fb);
+        if (disti_ray_alone(tracer, ray, q, f, ray->b, ray->fb, 1e-3f))
+            return disti_ray_open_bracket(tracer, ray, q, f, ray->b, ray->fb);
+    }
+    disti_ray_move(tracer, ray, f);
+    return disti_ray_onward(tracer, ray);
+}
+
 /* One sample f at ray->q: what follows from it. 1: another query at ray->q; 0: done, ray->status says how. */
 static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float sample)
 {
@@ -10042,126 +10190,13 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
         return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->b, ray->fb);
     if (ray->steps >= tracer->how.max_steps && f > 0.0f) return disti_ray_give_up(ray);
     switch (ray->mode) {
-    case DISTI_FIRST:
-        if (f < 0.0f && q <= ray->enter) return disti_ray_inside(tracer, ray, f);
-        if (f < 0.0f) { /* the cone came too far: the Lipschitz figure was too small here */
-            ray->b = q;
-            ray->fb = f;
-            ray->width = DISTI_MAX(1.5f * -f / tracer->lipschitz, disti_ray_epsilon(tracer, ray, q));
-            return disti_ray_ask(ray, DISTI_BACK, DISTI_MAX(q - ray->width, ray->enter));
-        }
-        ray->s = q;
-        ray->f = f;
-        ray->slope = ray->fa = 0.0f;
-        ray->known = 0;
-        if (ray->fb > 0.0f) { /* the second query */
-            ray->a = q;
-            ray->fa = f;
-            ray->s = ray->b;
-            ray->f = ray->fb;
-            ray->slope = (ray->f - f) / (ray->b - q);
-            ray->known = 1;
-            ray->fb = 0.0f;
-        } else if (f < disti_ray_near(tracer, ray, q) && q > ray->enter && !(ray->fb < 0.0f)) {
-            ray->b = q; /* cones or other rays' spheres led up to this: does f fall toward it? One looks from before */
-            ray->fb = DISTI_MAX(f, 1e-30f); /* 0: none */
-            return disti_ray_ask(ray, DISTI_FIRST, DISTI_MAX(q - 4.0f * disti_ray_near(tracer, ray, q), ray->enter));
-        }
-        break;
-    case DISTI_BACK:
-        if (f >= 0.0f) return disti_ray_open_bracket(tracer, ray, q, f, ray->b, ray->fb);
-        if (q <= ray->enter) return disti_ray_inside(tracer, ray, f);
-        ray->b = q;
-        ray->fb = f;
-        ray->width *= 1.6f;
-        return disti_ray_ask(ray, DISTI_BACK, DISTI_MAX(q - ray->width, ray->enter));
+    case DISTI_FIRST: return disti_ray_first(tracer, ray, f);
+    case DISTI_BACK: return disti_ray_backed(tracer, ray, f);
     case DISTI_BAND: return disti_ray_band(tracer, ray, f);
     case DISTI_LEAST: return disti_ray_leasted(tracer, ray, f);
     case DISTI_PREDICT: return disti_ray_predicted(tracer, ray, f);
-    case DISTI_SKIP:
-    case DISTI_MARCH:
-    case DISTI_JUMP: {
-        float radius = disti_empty(tracer, ray->f), step = q - ray->s;
-        float spacing = 4.8e-7f * tracer->field->radius;
-        if (ray->fb < 0.0f && f > 0.0f && q < ray->b && ++ray->side >= 3 && !tracer->how.certified &&
-            (ray->side >= 8 || disti_ray_alone(tracer, ray, q, f, ray->b, ray->fb, 2e-3f)))
-            return disti_ray_open_bracket(tracer, ray, q, f, ray->b, ray->fb);
-        float gap = step - radius - disti_empty(tracer, f < 0.0f ? -f : f); /* what neither sphere covers */
-        int back = ray->mode != DISTI_SKIP && step > 1.0001f * radius + spacing;
-        float off = f - (ray->f + ray->slope * step);
-        int foretold = ray->known && (off < 0.0f ? -off : off) < 0.5f * (off - f); /* as deep as expected */
-        float room = (foretold ? 2e-2f : 1e-3f) * tracer->field->radius;
-        if (tracer->how.certified) room = disti_ray_epsilon(tracer, ray, ray->s);
-        if (f <= 0.0f && !(back && gap > room))
-            return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, q, f);
-        if (back && (f <= 0.0f || (gap > 0.0f && !disti_ray_trusts(tracer, ray, f, step)))) {
-            float slope = (f - ray->f) / step; /* something may hide in the gap: back, and keep the far sample */
-            ray->slope = DISTI_MAX(slope, -tracer->lipschitz);
-            ray->known = 1;
-            if (f <= 0.0f || !(ray->fb < 0.0f)) {
-                ray->side = 0;
-                ray->b = q;
-                ray->fb = f;
-            }
-            return disti_ray_ask(ray, DISTI_MARCH, DISTI_MIN(ray->s + DISTI_MAX(radius, spacing), ray->leave));
-        }
-        if (disti_ray_doubts(tracer, ray, f, step)) { /* back to where the last step began, and keep where it ended */
-            ray->slope = (ray->f - ray->fa) / (ray->s - ray->a);
-            ray->b = ray->s;
-            ray->fb = ray->f;
-            ray->s = ray->a;
-            ray->f = ray->fa;
-            ray->fa = 0.0f;
-            radius = disti_empty(tracer, ray->f);
-            return disti_ray_ask(ray, DISTI_MARCH, DISTI_MIN(ray->s + DISTI_MAX(radius, spacing), ray->leave));
-        }
-        disti_ray_creeps(tracer, ray, f, back && gap > 0.0f);
-        if (ray->fb < 0.0f) { /* a crossing lies before b: is there room for another before it? */
-            if (ray->b <= q) return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->b, ray->fb);
-            if (disti_ray_alone(tracer, ray, q, f, ray->b, ray->fb, 1e-3f))
-                return disti_ray_open_bracket(tracer, ray, q, f, ray->b, ray->fb);
-        }
-        ray->a = ray->s;
-        ray->fa = ray->mode == DISTI_SKIP ? 0.0f : ray->f;
-        float clamp = tracer->field->clamp > 0.0f ? 0.98f * tracer->field->clamp : 3e38f;
-        int clamped = f > clamp || ray->f > clamp; /* then no slope is known, and none foretells a surface */
-        ray->slope = clamped ? DISTI_MAX((f - ray->f) / step, 0.0f) : (f - ray->f) / step;
-        ray->s = q;
-        ray->f = f;
-        ray->known = 1;
-        if (ray->fb > 0.0f && ray->b > q &&
-            ray->b - q <= disti_empty(tracer, f) + disti_empty(tracer, ray->fb)) { /* the gap is closed */
-            clamped = f > clamp || ray->fb > clamp;
-            ray->slope = clamped ? DISTI_MAX((ray->fb - f) / (ray->b - q), 0.0f) : (ray->fb - f) / (ray->b - q);
-            ray->s = ray->b;
-            ray->f = ray->fb;
-            ray->fa = 0.0f;
-        }
-        if (ray->b <= q) ray->fb = 0.0f;
-        break;
     }
-    }
-    if (ray->f < disti_ray_near(tracer, ray, ray->s)) {
-        if (ray->fb < 0.0f && ray->b > ray->s) { /* what is near need not be what is at b */
-            if (!disti_ray_alone(tracer, ray, ray->s, ray->f, ray->b, ray->fb, 2e-3f))
-                return disti_ray_step(tracer, ray);
-            return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->b, ray->fb);
-        }
-        float epsilon = disti_ray_near(tracer, ray, ray->s);
-        ray->side = 0;
-        ray->moved = ray->slope < 0.0f; /* came down to here from farther out: from a, or where f was epsilon */
-        ray->b = ray->fa > 0.0f ? ray->a : ray->s;
-        ray->fb = ray->fa > 0.0f ? ray->fa : ray->f;
-        if (ray->moved && !(ray->fa > 0.0f)) {
-            ray->b += (epsilon - ray->f) / ray->slope;
-            ray->fb = epsilon;
-        }
-        ray->a = ray->s;
-        ray->fa = ray->f;
-        return disti_ray_feel(tracer, ray, epsilon);
-    }
-    if (ray->s >= ray->leave) return disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest * ray->sign, 0.0f);
-    return disti_ray_aims(tracer, ray, ray->f) ? disti_ray_aim(ray) : disti_ray_step(tracer, ray);
+    return disti_ray_marched(tracer, ray, f); /* DISTI_MARCH, DISTI_SKIP, DISTI_JUMP */
 }
 
 /* A worker's share of the tracer's memory. */

@@ -1877,56 +1877,85 @@ typedef struct disti_kernels {
     void (*transpose)(const float *const *rows, float scale, float *to, size_t stride);
 } disti_kernels;
 
-/* The scalar kernels are the definition; the others are measured against them. */
-static void disti_gemm_row(const disti_gemm *g, int o)
+/* The scalar kernels are the definition; the others are measured against them. They hold two rows of four sums, or
+   eight, in variables of their own, which the registers of any processor have room for: in memory, each would be loaded
+   and stored again with each of its terms. */
+#define DISTI_FOUR(M) M(0) M(1) M(2) M(3)
+
+/* y[o] and y[p] */
+static void disti_gemm_rows(const disti_gemm *g, int o, int p)
 {
-    const int count = g->alive ? g->alive_count : g->rows;
-    const float *w = g->weights + (size_t)(o / 8) * (size_t)g->rows * 8 + o % 8;
-    float *y = g->y + (size_t)o * DISTI_BLOCK;
-    for (int c = 0; c < g->columns; c++) y[c] = g->bias[o];
-    for (int i = 0; i < count; i++) {
-        const size_t k = (size_t)(g->alive ? g->alive[i] : i);
-        const float *x = g->x + k * DISTI_BLOCK;
-        for (int c = 0; c < g->columns; c++) y[c] += w[k * 8] * x[c];
+    const int count = g->alive ? g->alive_count : g->rows, both[2] = {o, p};
+    const float *w0 = g->weights + (size_t)(o / 8) * (size_t)g->rows * 8 + o % 8;
+    const float *w1 = g->weights + (size_t)(p / 8) * (size_t)g->rows * 8 + p % 8;
+    float *y0 = g->y + (size_t)o * DISTI_BLOCK, *y1 = g->y + (size_t)p * DISTI_BLOCK;
+    for (int c = 0; c < g->columns; c += 4) {
+#define DISTI_BEGIN(j) float a##j = g->bias[o], b##j = g->bias[p];
+#define DISTI_TERM(j) a##j += a * x[j]; b##j += b * x[j];
+#define DISTI_END(j) y0[c + j] = a##j; y1[c + j] = b##j;
+        DISTI_FOUR(DISTI_BEGIN)
+        for (int i = 0; i < count; i++) {
+            const size_t k = (size_t)(g->alive ? g->alive[i] : i);
+            const float *x = g->x + k * DISTI_BLOCK + c, a = w0[k * 8], b = w1[k * 8];
+            DISTI_FOUR(DISTI_TERM)
+        }
+        DISTI_FOUR(DISTI_END)
+#undef DISTI_BEGIN
+#undef DISTI_TERM
+#undef DISTI_END
     }
-    uint64_t bits = 0;
-    for (int c = 0; c < g->columns; c++) {
-        y[c] += 0.0f; /* minus zero becomes zero, so that a zero row left out cannot show in its sign */
-        if (!g->mask && !g->relu) continue;
-        if (y[c] > 0.0f) bits |= (uint64_t)1 << c;
-        else y[c] = 0.0f;
+    for (int r = 0; r < 2; r++) {
+        float *y = g->y + (size_t)both[r] * DISTI_BLOCK;
+        uint64_t bits = 0;
+        for (int c = 0; c < g->columns; c++) {
+            y[c] += 0.0f; /* minus zero becomes zero, so that a zero row left out cannot show in its sign */
+            if (!g->mask && !g->relu) continue;
+            if (y[c] > 0.0f) bits |= (uint64_t)1 << c;
+            else y[c] = 0.0f;
+        }
+        if (g->mask) g->mask[both[r]] = bits;
     }
-    if (g->mask) g->mask[o] = bits;
 }
 
 static void disti_gemm_scalar(const disti_gemm *g)
 {
-    for (int o = 0; o < (g->out + 7) / 8 * 8; o++) disti_gemm_row(g, o);
+    for (int o = 0; o < (g->out + 7) / 8 * 8; o += 2) disti_gemm_rows(g, o, o + 1);
 }
 
 static void disti_gemm_some_scalar(const disti_gemm *g, const int *list, int count)
 {
     memset(g->mask, 0, (size_t)g->out * sizeof(uint64_t));
-    for (int i = 0; i < count; i++) disti_gemm_row(g, list[i]);
+    for (int i = 0; i < count; i += 2) disti_gemm_rows(g, list[i], list[DISTI_MIN(i + 1, count - 1)]);
 }
 
 static void disti_gemm_back_scalar(const disti_gemm_back *g)
 {
     const int count = g->alive_rows ? g->alive_rows_count : g->rows;
     const int out_count = g->alive_out ? g->alive_out_count : g->out;
-    for (int n = 0; n < count; n++) {
-        const size_t k = (size_t)(g->alive_rows ? g->alive_rows[n] : n);
-        float *d_x = g->d_x + k * DISTI_BLOCK;
-        for (int c = 0; c < g->columns; c++) d_x[c] = 0.0f;
-        for (int i = 0; i < out_count; i++) {
-            const size_t o = (size_t)(g->alive_out ? g->alive_out[i] : i);
-            const float w = g->weights[(o / 8 * (size_t)g->rows + k) * 8 + o % 8];
-            const float *d_y = g->d_y + o * DISTI_BLOCK;
-            for (int c = 0; c < g->columns; c++) d_x[c] += w * d_y[c];
+    for (int n = 0; n < count; n += 2) {
+        const int m = DISTI_MIN(n + 1, count - 1);
+        const size_t k[2] = {(size_t)(g->alive_rows ? g->alive_rows[n] : n),
+                             (size_t)(g->alive_rows ? g->alive_rows[m] : m)};
+        float *d0 = g->d_x + k[0] * DISTI_BLOCK, *d1 = g->d_x + k[1] * DISTI_BLOCK;
+        for (int c = 0; c < g->columns; c += 4) {
+#define DISTI_BEGIN(j) float a##j = 0.0f, b##j = 0.0f;
+#define DISTI_TERM(j) a##j += w[k[0] * 8] * d_y[j]; b##j += w[k[1] * 8] * d_y[j];
+#define DISTI_END(j) d0[c + j] = a##j; d1[c + j] = b##j;
+            DISTI_FOUR(DISTI_BEGIN)
+            for (int i = 0; i < out_count; i++) {
+                const size_t o = (size_t)(g->alive_out ? g->alive_out[i] : i);
+                const float *w = g->weights + o / 8 * (size_t)g->rows * 8 + o % 8;
+                const float *d_y = g->d_y + o * DISTI_BLOCK + c;
+                DISTI_FOUR(DISTI_TERM)
+            }
+            DISTI_FOUR(DISTI_END)
+#undef DISTI_BEGIN
+#undef DISTI_TERM
+#undef DISTI_END
         }
-        if (!g->mask) continue;
-        for (int c = 0; c < g->columns; c++)
-            if (!(g->mask[k] >> c & 1)) d_x[c] = 0.0f;
+        for (int r = 0; r < 2 && g->mask; r++)
+            for (int c = 0; c < g->columns; c++)
+                if (!(g->mask[k[r]] >> c & 1)) g->d_x[k[r] * DISTI_BLOCK + (size_t)c] = 0.0f;
     }
 }
 
@@ -1934,11 +1963,20 @@ static void disti_gemm_weights_scalar(const disti_gemm_weights *g)
 {
     for (int o = 0; o < g->out; o++) {
         const float *d_y = g->d_y + (size_t)o * DISTI_BLOCK;
-        float *d_weights = g->d_weights + (size_t)o * g->stride;
-        for (int k = 0; k < g->rows; k++) {
-            float sum = 0.0f;
-            for (int c = 0; c < g->columns; c++) sum += d_y[c] * g->xt[(size_t)c * g->xt_stride + (size_t)k];
-            d_weights[k] += sum;
+        for (int k = 0; k < g->rows; k += 4) {
+            float *d_weights = g->d_weights + (size_t)o * g->stride + k;
+#define DISTI_BEGIN(j) float a##j = 0.0f;
+#define DISTI_TERM(j) a##j += d_y[c] * x[j];
+#define DISTI_END(j) if (k + j < g->rows) d_weights[j] += a##j;
+            DISTI_FOUR(DISTI_BEGIN)
+            for (int c = 0; c < g->columns; c++) {
+                const float *x = g->xt + (size_t)c * g->xt_stride + k;
+                DISTI_FOUR(DISTI_TERM)
+            }
+            DISTI_FOUR(DISTI_END)
+#undef DISTI_BEGIN
+#undef DISTI_TERM
+#undef DISTI_END
         }
     }
 }
@@ -2328,22 +2366,30 @@ static void disti_relu_scalar(size_t rows, float *y, uint64_t *mask)
 
 static void disti_few_scalar(const disti_few *g)
 {
-    for (int o = 0; o < (g->out + 7) / 8 * 8; o++) {
-        const float *w = g->weights + (size_t)(o / 8) * (size_t)g->rows * 8 + o % 8;
-        float sum[DISTI_FEW_POINTS];
-        for (int c = 0; c < g->points; c++) sum[c] = g->bias[o];
-        for (int i = 0; i < g->count; i++) {
-            const size_t k = (size_t)g->list[i];
-            for (int c = 0; c < g->points; c++) sum[c] += w[k * 8] * g->x[(size_t)c * g->stride + k];
-        }
-        g->most[o] = 0.0f;
-        for (int c = 0; c < g->points; c++) {
-            const float v = sum[c] > 0.0f ? sum[c] : 0.0f;
-            g->y[(size_t)c * g->stride + (size_t)o] = v;
-            g->most[o] = DISTI_MAX(g->most[o], v);
+    for (int o = 0; o < (g->out + 7) / 8 * 8; o += 8) {
+        const float *weights = g->weights + (size_t)o * (size_t)g->rows, *bias = g->bias + o;
+        for (int i = 0; i < 8; i++) g->most[o + i] = 0.0f;
+        for (size_t c = 0; c < (size_t)g->points; c++) {
+            const float *x = g->x + c * g->stride;
+            float *y = g->y + c * g->stride + o;
+#define DISTI_BEGIN(j) float a##j = bias[j], b##j = bias[4 + j];
+#define DISTI_TERM(j) a##j += w[j] * x[k]; b##j += w[4 + j] * x[k];
+#define DISTI_END(j) y[j] = a##j > 0.0f ? a##j : 0.0f; y[4 + j] = b##j > 0.0f ? b##j : 0.0f;
+            DISTI_FOUR(DISTI_BEGIN)
+            for (int i = 0; i < g->count; i++) {
+                const size_t k = (size_t)g->list[i];
+                const float *w = weights + k * 8;
+                DISTI_FOUR(DISTI_TERM)
+            }
+            DISTI_FOUR(DISTI_END)
+#undef DISTI_BEGIN
+#undef DISTI_TERM
+#undef DISTI_END
+            for (int i = 0; i < 8; i++) g->most[o + i] = DISTI_MAX(g->most[o + i], y[i]);
         }
     }
 }
+#undef DISTI_FOUR
 
 static void disti_transpose_scalar(const float *const *rows, float scale, float *to, size_t stride)
 {

@@ -12070,9 +12070,11 @@ static void disti_silhouette_take(const disti_tracer *tracer, int worker, const 
 }
 
 /* Parabolas through three samples around the least one of the rays with width > 0: how far apart, in units of f. Both
-   sides are asked for in one call, then where the parabola is least. */
-static void disti_silhouette_fit(const disti_tracer *tracer, int worker, const disti_bench *bench, int n)
+   sides are asked for in one call, then where the parabola is least. If that is beyond a side, f falls farther, and
+   width stays positive: twice as wide, around that side. Returns how many rays it does for. */
+static size_t disti_silhouette_parabolas(const disti_tracer *tracer, int worker, const disti_bench *bench, int n)
 {
+    size_t falling = 0;
     for (int i = 0; i < n;) { /* as many rays as there is room for */
         size_t count = 0;
         for (; i < n && count + 2 <= (size_t)DISTI_TILE_RAYS; i++) {
@@ -12093,11 +12095,24 @@ static void disti_silhouette_fit(const disti_tracer *tracer, int worker, const d
             if (k < asked) disti_keep_least(ray, disti_ray_within(ray, ray->a - width), bench->sdf[k]);
             if (k + 1 >= asked) continue;
             disti_keep_least(ray, disti_ray_within(ray, ray->a + width), bench->sdf[k + 1]);
-            float least = disti_parabola(width, bench->sdf[k], ray->fa, bench->sdf[k + 1]);
+            float left = bench->sdf[k], right = bench->sdf[k + 1], fall = left < right ? right - left : left - right;
+            if (ray->best != ray->a && !(left - 2.0f * ray->fa + right > 0.5f * fall)) {
+                ray->width = 2.0f * width / DISTI_MAX(ray->fbest, 1e-30f);
+                falling++;
+                continue;
+            }
+            float least = disti_parabola(width, left, ray->fa, right);
             kept = disti_silhouette_ask(bench, index, ray->a + least, kept);
         }
         disti_silhouette_take(tracer, worker, bench, kept);
     }
+    return falling;
+}
+
+static void disti_silhouette_fit(const disti_tracer *tracer, int worker, const disti_bench *bench, int n)
+{
+    for (int k = 0; k < 5 && disti_silhouette_parabolas(tracer, worker, bench, n) > 0; k++) continue;
+    for (int i = 0; i < n; i++) bench->rays[i].width = 0.0f;
 }
 
 enum { DISTI_NODE = 4 }; /* pixels between nodes; the tile's last row and column have some, too */
@@ -12161,6 +12176,7 @@ static size_t disti_silhouette_place(const disti_tracer *tracer, const disti_til
         if (agree) t = between;
         if (agree) f = value;
     }
+    ray->fb = agree == 4 ? f : 0.0f; /* what is to be expected; beside hits nothing is */
     float s = f < 2e38f ? (float)((double)t - ray->base) : 0.0f;
     if (agree == 4 && f > enough) {
         disti_keep_least(ray, s, f);
@@ -12190,6 +12206,12 @@ static void disti_silhouette(const disti_tracer *tracer, int worker, const disti
                 if (disti_silhouette_node(tile, x, y, h) && disti_wants_minimum(&bench->rays[y * w + x]))
                     count = disti_silhouette_place(tracer, tile, bench, x, y, h, enough, count);
         disti_silhouette_take(tracer, worker, bench, count);
+        for (size_t k = 0; k < count && h < DISTI_NODE; k++) { /* where f is larger than foretold, the minimum is not */
+            disti_ray *ray = &bench->rays[bench->index[k]];
+            int looks = ray->fbest > near && ray->fbest < far; /* nearer ones do in any case */
+            if (looks && ray->fbest > 1.2f * ray->fb + 5e-4f * radius) ray->width = 0.35f;
+        }
+        if (h < DISTI_NODE) disti_silhouette_fit(tracer, worker, bench, n);
         if (h < DISTI_NODE) continue;
         for (int i = 0; i < n; i++)
             if (h == DISTI_NODE && bench->rays[i].fbest > far) bench->rays[i].width = 0.0f;

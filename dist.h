@@ -2222,7 +2222,7 @@ DISTI_INLINE float disti_curvature(int activation, float scale, float v, float d
 {
     switch (activation) {
     case DIST_ACTIVATION_ELU: return v > 0.0f ? 0.0f : d;
-    case DIST_ACTIVATION_SOFTPLUS: return scale * d * (1.0f - d);
+    case DIST_ACTIVATION_SOFTPLUS: return scale * d * disti_exp_falling(scale * v); /* 1 - d without cancellation */
     case DIST_ACTIVATION_SINE: return -scale * scale * v;
     case DIST_ACTIVATION_TANH: return -2.0f * v * d;
     }

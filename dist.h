@@ -423,7 +423,8 @@ typedef struct dist_net_desc {
 } dist_net_desc;
 DIST_API dist_net *dist_net_create(dist_context *ctx, const dist_net_desc *desc);
 /* Replace all weights (dist_net_weight_count) or one stored code. The caller sees to it that no shape is in use by
-   another thread; shapes of this net see the change at their next dist_shape_set_code. */
+   another thread. After new weights each shape of the net wants dist_shape_set_code before it is used again: until then
+   it has the new weights beside biases with its code and the old ones folded in, which is no function of either. */
 DIST_API dist_status dist_net_set_weights(dist_context *ctx, dist_net *net, const float *weights);
 DIST_API dist_status dist_net_set_code(dist_context *ctx, dist_net *net, int index, const float *code);
 #endif
@@ -445,7 +446,8 @@ DIST_API dist_status dist_shape_set_color_code(dist_shape *shape, const float *c
 /* The field of the net's distance channel. Borrows the shape. A net without one (r,g,b) gives a field that render
    refuses. */
 DIST_API dist_field dist_shape_field(dist_shape *shape);
-/* All output channels (n, dist_net_channels) at n points; the distance's is f, so dist.level is off it. */
+/* All output channels (n, dist_net_channels) at n points, in the order of the file's dist.channels; the distance's is
+   f, so dist.level is off it. */
 DIST_API dist_status dist_shape_eval(dist_context *ctx, dist_shape *shape, size_t n, const float *points,
                                      float *channels);
 
@@ -455,16 +457,17 @@ DIST_API dist_status dist_shape_eval(dist_context *ctx, dist_shape *shape, size_
    pixel u = fx X/Z + skew Y/Z + cx, v = fy Y/Z + cy. */
 typedef struct dist_camera {
     float fx, fy, cx, cy, skew; /* pixels; fx and fy not 0, below 0: mirrored */
-    float rotation[9]; /* rows off orthonormal by up to 1e-3 are made exact, more is refused: dist_camera_move by 0
-                          projects */
+    float rotation[9]; /* rows off orthonormal by up to 1e-3 are made exact, more is refused. dist_camera_move by 0
+                          projects it; a matrix with a scale is to be divided by that before */
     float translation[3];
     int width, height;  /* 1 to 65536 */
     float pixel_center; /* coordinate of the first pixel's center: 0 (OpenCV, the authors) or 0.5 (COLMAP, OpenGL) */
 } dist_camera;
 
 /* fx = fy = height / 2 / tan(fov_y / 2), cx = (width - 1) / 2, cy = (height - 1) / 2, pixel centers at integers.
-   Degenerate input (eye = at, up along the view) is repaired by choosing another up; what cannot be repaired, such as
-   fov_y in degrees, makes fx 0 or something not finite, which the function that takes the camera refuses. */
+   Degenerate input (eye = at, up along the view or NULL) is repaired by choosing another up; what cannot be repaired,
+   such as fov_y in degrees, eye or at NULL or not finite, makes fx 0, which the function that takes the camera
+   refuses. */
 DIST_API dist_camera dist_camera_look_at(int width, int height, float fov_y /* radians, above 0, below pi */,
                                          const float eye[3], const float at[3], const float up[3]);
 /* camera_to_world: row-major 3 x 4 or the upper part of 4 x 4, x right, y up, z backward (OpenGL, Blender, NeRF). */
@@ -484,9 +487,12 @@ DIST_API void dist_camera_ray(const dist_camera *camera, float x, float y, float
 
 enum { DIST_TRACE_GUARDED = 0, DIST_TRACE_PAPER = 1 };
 enum { DIST_PAPER_COARSE_TO_FINE = 0, DIST_PAPER_AGGRESSIVE, DIST_PAPER_DYNAMIC, DIST_PAPER_PARALLEL };
+/* Of depth: IMPLICIT: -df / (grad f . v), exact at the hit. NORMAL: that times |n . v|, so that grazing pixels do not
+   dominate. PAPER: alpha times the sum of df over the K = how.samples samples of smallest |f|: it grows with K. */
 enum { DIST_GRADIENT_AUTO = 0, DIST_GRADIENT_IMPLICIT, DIST_GRADIENT_NORMAL, DIST_GRADIENT_PAPER };
 enum { DIST_NORMAL_ANALYTIC = 0, DIST_NORMAL_DIFFERENCE = 1 };
 enum { DIST_SPACE_CAMERA = 0, DIST_SPACE_WORLD = 1 };
+/* Of a ray that starts in the solid: no hit; a hit at its start; what it meets on its way out (guarded tracer). */
 enum { DIST_INSIDE_BACKGROUND = 0, DIST_INSIDE_HIT = 1, DIST_INSIDE_EXIT = 2 };
 
 enum {
@@ -512,7 +518,8 @@ typedef struct dist_render_desc {
     int gradient;        /* DIST_GRADIENT_*; AUTO: IMPLICIT with the guarded tracer, PAPER with the paper's */
     float gradient_cap;  /* tau, to 1: |grad f . v| counts as at least tau |grad f|; 0: 0.1 */
     int normal_mode;     /* DIST_NORMAL_* */
-    float normal_delta;  /* half step of differences, shape units; 0: 1e-3 of the bounding radius or field.detail */
+    float normal_delta;  /* half step of differences, shape units, 1e-6 to 1 of the radius; 0: 1e-3 of the bounding
+                            radius or field.detail */
     int normal_space;    /* DIST_SPACE_* */
     int inside;          /* DIST_INSIDE_* */
     float background;    /* depth and distance at a miss, finite */
@@ -573,7 +580,7 @@ typedef struct dist_hit {
     float error;    /* bound on the distance's error, as good as f's slopes are sampled; no neighbors are asked */
     float sdf;      /* f there, 0 at a hit; 3e38: no sample */
     int status;     /* DIST_RAY_* */
-} dist_hit;
+} dist_hit; /* DIST_RAY_NOT_FINITE: distance, error and sdf say nothing */
 
 /* Traces n rays (origins (n, 3), directions (n, 3) of any length from 1.2e-38 on) with the guarded tracer: picking,
    shadows, visibility. The first surface in front of each origin; with how.any_hit any of them. A ray that is 0 or not
@@ -728,6 +735,7 @@ typedef struct dist_photo {
 typedef struct dist_photometric_desc {
     float visibility;       /* largest squared difference of the two depths, world units; 0: 1e-3; negative: any */
     float ssim;             /* share of structural similarity, 0 to 1 */
+    /* Not written where something is refused. */
     float *warped;          /* (h, w, 3) of `to`: gets what `from` shows of it, 0 where nothing; NULL: not wanted */
     unsigned char *visible; /* (h, w) of `to`: gets 1 at the pixels that count; NULL: not wanted */
 } dist_photometric_desc;
@@ -859,8 +867,8 @@ typedef struct dist_workspace_desc {
    each rounded up to one, and takes nothing back: exactly; with one less some create function fails with
    DIST_OUT_OF_MEMORY. The create functions' own code is run without memory. dist_net_load_file needs its file's bytes
    besides, meshes and Chamfer distance theirs.
-   0: a create function would refuse (but for weights that are not finite, which are not looked at);
-   desc->context->logger is told why. The table of contents of a model is read into
+   0: a create function would refuse (but for what only tensors' numbers, types and biases tell, which are not looked
+   at); desc->context->logger is told why. The table of contents of a model is read into
    memory of desc->context->allocator, or malloc's, and given back. */
 DIST_API size_t dist_workspace_bytes(const dist_workspace_desc *desc);
 
@@ -1109,6 +1117,61 @@ typedef struct disti_counter {
     double done;
 } disti_counter;
 
+/* Appends a whole number. */
+static size_t disti_format_whole(char *out, uint64_t value)
+{
+    char reversed[24];
+    size_t count = 0, n = 0;
+    do {
+        reversed[count++] = (char)('0' + (int)(value % 10u));
+        value /= 10u;
+    } while (value);
+    while (count) out[n++] = reversed[--count];
+    return n;
+}
+
+/* The first `digits` of x > 0, as a whole number, and the power of ten of the first; the last ones are off by up to two
+   units in the last place of x. */
+static uint64_t disti_decimal_digits(double x, int digits, int *exponent)
+{
+    double scale = 1.0;
+    *exponent = 0;
+    while (x >= 10.0) x /= 10.0, ++*exponent;
+    while (x < 1.0) x *= 10.0, --*exponent;
+    for (int i = 1; i < digits; i++) scale *= 10.0;
+    uint64_t mantissa = (uint64_t)(x * scale + 0.5);
+    if (mantissa < (uint64_t)(scale * 10.0)) return mantissa;
+    ++*exponent;
+    return mantissa / 10u;
+}
+
+/* Appends such digits, at most 17, without the zeros at their end. */
+static size_t disti_format_digits(char *out, uint64_t mantissa, int digits, int exponent)
+{
+    char text[17];
+    size_t n = 0;
+    for (int i = digits - 1; i >= 0; i--) {
+        text[i] = (char)('0' + (int)(mantissa % 10u));
+        mantissa /= 10u;
+    }
+    int last = digits - 1;
+    while (last > 0 && text[last] == '0') last--;
+    int plain = exponent >= -4 && exponent < digits;
+    int point = plain ? exponent : 0; /* the digit after which the point stands */
+    for (int i = 0; i > point; i--) {
+        out[n++] = '0';
+        if (i == 0) out[n++] = '.';
+    }
+    for (int i = 0; i <= last || i <= point; i++) {
+        out[n++] = i <= last ? text[i] : '0';
+        if (i == point && i < last) out[n++] = '.';
+    }
+    if (plain || exponent == 0) return n;
+    out[n++] = 'e';
+    if (exponent < 0) out[n++] = '-';
+    return n + disti_format_whole(out + n, (uint64_t)(exponent < 0 ? -exponent : exponent));
+}
+
 /* Appends a number as a person writes it: integers plainly, others with `digits` (at most 15) significant ones. */
 static size_t disti_format_number(char *out, double x, int digits)
 {
@@ -1123,45 +1186,10 @@ static size_t disti_format_number(char *out, double x, int digits)
         memcpy(out + n, (bits & 0xfffffffffffffu) ? "nan" : "inf", 3);
         return n + 3;
     }
-    int exponent = 0;
-    if (!(x < 1e15 && x == (double)(uint64_t)x)) {
-        double scale = 1.0;
-        while (x >= 10.0) x /= 10.0, exponent++;
-        while (x < 1.0) x *= 10.0, exponent--;
-        for (int i = 1; i < digits; i++) scale *= 10.0;
-        uint64_t mantissa = (uint64_t)(x * scale + 0.5);
-        if (mantissa >= (uint64_t)(scale * 10.0)) mantissa /= 10u, exponent++;
-        char text[16];
-        for (int i = digits - 1; i >= 0; i--) {
-            text[i] = (char)('0' + (int)(mantissa % 10u));
-            mantissa /= 10u;
-        }
-        int last = digits - 1;
-        while (last > 0 && text[last] == '0') last--;
-        int plain = exponent >= -4 && exponent < digits;
-        int point = plain ? exponent : 0; /* the digit after which the point stands */
-        for (int i = 0; i > point; i--) {
-            out[n++] = '0';
-            if (i == 0) out[n++] = '.';
-        }
-        for (int i = 0; i <= last || i <= point; i++) {
-            out[n++] = i <= last ? text[i] : '0';
-            if (i == point && i < last) out[n++] = '.';
-        }
-        if (plain || exponent == 0) return n;
-        out[n++] = 'e';
-        if (exponent < 0) out[n++] = '-';
-        x = exponent < 0 ? -exponent : exponent;
-    }
-    char reversed[24];
-    size_t count = 0;
-    uint64_t value = (uint64_t)x;
-    do {
-        reversed[count++] = (char)('0' + (int)(value % 10u));
-        value /= 10u;
-    } while (value);
-    while (count) out[n++] = reversed[--count];
-    return n;
+    if (x < 1e15 && x == (double)(uint64_t)x) return n + disti_format_whole(out + n, (uint64_t)x);
+    int exponent;
+    uint64_t mantissa = disti_decimal_digits(x, digits, &exponent);
+    return n + disti_format_digits(out + n, mantissa, digits, exponent);
 }
 
 /* Appends text, as long as 64 bytes stay free. Unprintable bytes become '?': it may come out of a hostile file. */
@@ -1690,17 +1718,30 @@ static int disti_allocator_of(const dist_context_desc *desc, dist_allocator *all
 #endif
 }
 
+/* Without a context to keep the sentence, the logger alone is told. */
+static dist_context *disti_no_context(const dist_context_desc *desc, dist_status status, const char *message)
+{
+    if (desc->logger.log_fn) desc->logger.log_fn(desc->logger.user, status, message);
+    return NULL;
+}
+
 DIST_API dist_context *dist_context_create(const dist_context_desc *desc)
 {
     dist_context_desc d;
     dist_allocator allocator;
     memset(&d, 0, sizeof d);
     if (desc) d = *desc;
-    if (!disti_allocator_of(&d, &allocator)) return NULL;
+    if (!disti_allocator_of(&d, &allocator))
+        return disti_no_context(&d, DIST_BAD_ARGUMENT,
+                                "dist_context_create: allocator.alloc_fn or free_fn is NULL, must be both or, where "
+                                "this build has malloc, none");
     dist_context *ctx = (dist_context *)allocator.alloc_fn(allocator.user, sizeof(dist_context), DISTI_ALIGNMENT);
-    if (!ctx || (disti_is_aligned(ctx) && disti_context_begin(ctx, &d, &allocator) != DIST_OUT_OF_MEMORY)) return ctx;
+    if (!ctx) return disti_no_context(&d, DIST_OUT_OF_MEMORY, "dist_context_create: out of memory");
+    int aligned = disti_is_aligned(ctx);
+    if (aligned && disti_context_begin(ctx, &d, &allocator) != DIST_OUT_OF_MEMORY) return ctx;
     allocator.free_fn(allocator.user, ctx, sizeof *ctx);
-    return NULL;
+    if (aligned) return NULL; /* the logger knows */
+    return disti_no_context(&d, DIST_OUT_OF_MEMORY, "dist_context_create: what alloc_fn returned is not aligned");
 }
 
 DIST_API void dist_context_destroy(dist_context *ctx)
@@ -4355,6 +4396,7 @@ static void disti_backward_seed(void *user, size_t first, size_t count, const fl
     if (job->seed_fn && job->d_sdf) memcpy(job->d_sdf + at, d_sdf, count * sizeof(float));
     if (!job->d_points || !gradient) return;
     for (float *d = job->d_points + 3 * at; count > 0; count--, d += 3, gradient += 3, d_sdf++) {
+        if (!disti_finite(*d_sdf)) continue; /* nor does the code take it */
         d[0] += *d_sdf * gradient[0];
         d[1] += *d_sdf * gradient[1];
         d[2] += *d_sdf * gradient[2];
@@ -7429,7 +7471,7 @@ static void disti_half_hidden(const dist_shape *shape, const disti_block *b, int
     size_t rows = (size_t)(layer->prev + layer->point);
     int last = l + 2 == net->layers, pairs = net->half == DIST_HALF_BF16;
     h->steps = pairs ? (layer->prev + 1) / 2 : layer->prev;
-    h->weights = net->half_panels + layer->half_panel;
+    h->weights = net->half_panels ? net->half_panels + layer->half_panel : net->panels; /* steps is 0: not read */
     h->point_weights = net->panels + layer->panel + (size_t)layer->prev * 8;
     h->panel = rows * 8;
     h->point = layer->point;
@@ -8018,12 +8060,14 @@ static void disti_net_fold(const dist_net *net, const float *code, float *bias)
 static void disti_shape_fold(dist_shape *shape) { disti_net_fold(shape->net, shape->code, shape->bias); }
 
 /* Copies n numbers of a code, zeros for NULL; refuses what is not finite. */
-static dist_status disti_code_copy(dist_context *ctx, const char *function, size_t n, const float *code, float *to)
+static dist_status disti_code_copy(dist_context *ctx, const char *function, int color, size_t n, const float *code,
+                                   float *to)
 {
     for (size_t j = 0; code && j < n; j++)
         if (!disti_finite(code[j]))
-            return disti_fail(ctx, DIST_NOT_FINITE, "%s: code[%d] is %d, must be finite", function, (double)j,
-                              (double)code[j]);
+            return disti_fail(ctx, DIST_NOT_FINITE, color ? "%s: color_code[%d] is %d, must be finite"
+                                                          : "%s: code[%d] is %d, must be finite",
+                              function, (double)j, (double)code[j]);
     if (code) memcpy(to, code, n * sizeof(float));
     else memset(to, 0, n * sizeof(float));
     return DIST_OK;
@@ -8033,7 +8077,7 @@ static dist_status disti_code_copy(dist_context *ctx, const char *function, size
 static dist_status disti_shape_set_code(dist_shape *shape, const float *code, const char *function)
 {
     size_t size = (size_t)shape->net->code_size;
-    dist_status status = disti_code_copy(shape->ctx, function, size, code, shape->code);
+    dist_status status = disti_code_copy(shape->ctx, function, 0, size, code, shape->code);
     if (status != DIST_OK) return status;
     disti_shape_fold(shape);
     shape->changes++;
@@ -8055,7 +8099,7 @@ DIST_API dist_status dist_shape_set_color_code(dist_shape *shape, const float *c
     if (!shape->texture) return disti_refuse(shape->ctx, "%s: the shape has no texture", name);
     dist_shape *texture = shape->texture;
     size_t own = (size_t)shape->net->code_size, size = (size_t)texture->net->code_size;
-    dist_status status = disti_code_copy(shape->ctx, name, size - own, color_code, texture->code + own);
+    dist_status status = disti_code_copy(shape->ctx, name, 1, size - own, color_code, texture->code + own);
     if (status == DIST_OK) disti_shape_fold(texture);
     return status;
 }
@@ -8154,7 +8198,7 @@ DIST_API dist_status dist_shape_set_texture(dist_shape *shape, const dist_net *t
         paint = dist_shape_create(ctx, texture, NULL);
         if (!paint) return DIST_OUT_OF_MEMORY;
         memcpy(paint->code, shape->code, own * sizeof(float));
-        status = disti_code_copy(ctx, name, size - own, color_code, paint->code + own);
+        status = disti_code_copy(ctx, name, 1, size - own, color_code, paint->code + own);
         disti_shape_fold(paint);
     }
     if (status != DIST_OK) {
@@ -8188,11 +8232,11 @@ DIST_API dist_status dist_shape_eval(dist_context *ctx, dist_shape *shape, size_
 {
     dist_status status = disti_enter(ctx);
     if (status != DIST_OK) return status;
-    if (!shape || !points || !channels)
-        return disti_refuse(ctx, "dist_shape_eval: shape, points or channels is NULL", NULL);
+    if (!shape) return disti_refuse(ctx, "dist_shape_eval: shape is NULL", NULL);
     if (shape->ctx != ctx) return disti_refuse(ctx, "dist_shape_eval: shape belongs to another context", NULL);
     status = disti_count_check(ctx, n, "dist_shape_eval");
     if (status != DIST_OK || n == 0) return status;
+    if (!points || !channels) return disti_refuse(ctx, "dist_shape_eval: %s is NULL", points ? "channels" : "points");
     disti_channels_job job = {shape, disti_cut(n, 8 * DISTI_BLOCK, 1u << 20), points, channels};
     disti_run(ctx, job.pieces.count, disti_channels_task, &job);
     return DIST_OK;
@@ -8558,7 +8602,8 @@ static int disti_loader_whole(disti_loader *loader, const char *key, double low,
 static int disti_loader_choice(disti_loader *loader, const char *key, const char *choices)
 {
     const char *value = disti_archive_meta(&loader->archive, key), *end = choices;
-    for (int index = 0; value && end; index++, choices = end + 1) {
+    for (int index = 0; value && end; index++) {
+        if (index > 0) choices = end + 1;
         end = strchr(choices, '|');
         size_t length = end ? (size_t)(end - choices) : strlen(choices);
         if (length == strlen(value) && memcmp(choices, value, length) == 0) return index;
@@ -8694,9 +8739,9 @@ static dist_status disti_loader_shapes(disti_loader *loader)
     net->code_size = (int)size;
     for (int l = 1; l < net->layers && !list; l++)
         loader->skip[l] = net->layer[l].in == net->layer[l - 1].out + net->layer[0].in;
-    while (list && *list) {
-        if (!disti_scan_number(&list, &at) || !(at >= 1 && at < net->layers) || at != (int)at ||
-            (*list && *list != ','))
+    for (int entries = 1; list && *list; entries++) { /* each reads to the list's end: not more than can be */
+        if (entries > DISTI_MAX_LAYERS || !disti_scan_number(&list, &at) || !(at >= 1 && at < net->layers) ||
+            at != (int)at || (*list && *list != ','))
             return disti_loader_bad(loader, "dist.skip");
         loader->skip[(int)at] = 1;
         if (*list == ',') list++;
@@ -8848,6 +8893,24 @@ static void disti_saver_number(disti_saver *s, const char *key, const char *befo
     disti_saver_text(s, key, disti_saver_end(s, at));
 }
 
+/* key: x > 0, in as many digits as are read as x again: 15, else 17, the last ones by trial. */
+static void disti_saver_exactly(disti_saver *s, const char *key, double x)
+{
+    size_t at = s->w.size;
+    char text[32];
+    int exponent;
+    uint64_t mantissa = disti_decimal_digits(x, 17, &exponent);
+    for (uint64_t k = 0, found = 0; k < 129 && !found; k++) { /* then mantissa, + 1, - 1, + 2 ... */
+        double back = 0.0;
+        uint64_t digits = k & 1 ? mantissa - k / 2 : mantissa + k / 2;
+        const char *end = text;
+        text[k == 0 ? disti_format_number(text, x, 15) : disti_format_digits(text, digits, 17, exponent)] = 0;
+        found = disti_scan_number(&end, &back) && back == x;
+    }
+    disti_put_text(&s->w, text);
+    disti_saver_text(s, key, disti_saver_end(s, at));
+}
+
 static void disti_saver_meta(disti_saver *s, const dist_net *net)
 {
     static const char activations[6][12] = {"relu", "elu", "softplus:", "sine:", "tanh", "none"};
@@ -8883,7 +8946,7 @@ static void disti_saver_meta(disti_saver *s, const dist_net *net)
     disti_saver_text(s, "dist.encoding", net->levels ? "fourier" : "none");
     if (net->levels) {
         disti_saver_number(s, "dist.encoding.levels", "", net->levels, net->levels, 6);
-        disti_saver_number(s, "dist.encoding.base", "", net->base, net->base, 15);
+        disti_saver_exactly(s, "dist.encoding.base", net->base);
         disti_saver_text(s, "dist.encoding.raw", net->raw ? "1" : "0");
         disti_saver_text(s, "dist.encoding.order", orders[net->order]);
     }
@@ -9130,10 +9193,11 @@ DIST_API dist_status dist_net_set_code(dist_context *ctx, dist_net *net, int ind
 {
     dist_status status = disti_enter(ctx);
     if (status != DIST_OK) return status;
-    if (!net || !code || index < 0 || index >= net->code_count)
+    if (!net || !code) return disti_refuse(ctx, "dist_net_set_code: %s is NULL", net ? "code" : "net");
+    if (net->code_count == 0) return disti_refuse(ctx, "dist_net_set_code: the net stores no codes", NULL);
+    if (index < 0 || index >= net->code_count)
         return disti_fail(ctx, DIST_BAD_ARGUMENT,
-                          "dist_net_set_code: index is %d of %d codes; net and code must not be NULL", NULL, index,
-                          net ? net->code_count : 0);
+                          "dist_net_set_code: index is %d, must be 0 to %d", NULL, index, net->code_count - 1);
     for (int i = 0; i < net->code_size; i++)
         if (!disti_finite(code[i]))
             return disti_fail(ctx, DIST_NOT_FINITE, "dist_net_set_code: code[%d] is %d, must be finite", NULL, i,
@@ -9231,7 +9295,7 @@ DIST_API dist_camera dist_camera_look_at(int width, int height, float fov_y, con
         camera.fx = camera.fy = (float)(height / 2.0 / tan((double)fov_y / 2.0));
     camera.cx = (float)((width - 1.0) / 2.0);
     camera.cy = (float)((height - 1.0) / 2.0);
-    if ((eye && !disti_finite_all(3, eye)) || (at && !disti_finite_all(3, at)) || (up && !disti_finite_all(3, up)))
+    if (!eye || !disti_finite_all(3, eye) || !at || !disti_finite_all(3, at) || (up && !disti_finite_all(3, up)))
         camera.fx = 0.0f;
     for (int i = 0; i < 3; i++) {
         center[i] = eye ? (double)eye[i] : 0.0;
@@ -9439,6 +9503,10 @@ static dist_status disti_how_check(dist_context *ctx, const dist_render_desc *ho
     if (status != DIST_OK) return status;
     if (how->warm_start && how->trace != DIST_TRACE_GUARDED)
         return disti_refuse(ctx, "%s: how.warm_start is for DIST_TRACE_GUARDED, must be 0", function);
+    if (how->certified && how->trace != DIST_TRACE_GUARDED)
+        return disti_refuse(ctx, "%s: how.certified is for DIST_TRACE_GUARDED, must be 0", function);
+    if (how->inside == DIST_INSIDE_EXIT && how->trace != DIST_TRACE_GUARDED)
+        return disti_refuse(ctx, "%s: how.inside DIST_INSIDE_EXIT is for DIST_TRACE_GUARDED", function);
     if (!disti_finite(how->background))
         return disti_fail(ctx, DIST_NOT_FINITE, "%s: how.background is %d, must be finite", function,
                           (double)how->background, 0);
@@ -9476,6 +9544,10 @@ static dist_status disti_tracer_init(disti_tracer *tracer, dist_context *ctx, co
     tracer->how = dist_render_desc_resolve(desc);
     tracer->detail = field->detail > 0.0f ? field->detail : field->radius;
     if (tracer->how.normal_delta == 0.0f) tracer->how.normal_delta = 1e-3f * tracer->detail;
+    else if (!(raw.normal_delta >= 1e-6f * field->radius && raw.normal_delta <= field->radius))
+        return disti_fail(ctx, DIST_BAD_ARGUMENT,
+                          "%s: how.normal_delta is %d, must be 1e-6 to 1 of the field's radius, %d", function,
+                          (double)raw.normal_delta, (double)field->radius);
     tracer->lipschitz = tracer->how.lipschitz > 0.0f ? tracer->how.lipschitz
                         : field->lipschitz > 0.0f    ? field->lipschitz
                                                      : 1.0f;

@@ -542,6 +542,14 @@ TEST(the_first_failure_is_kept_and_the_logger_told_all)
     dist_context_destroy(ctx);
 }
 
+static void *no_memory(void *user, size_t bytes, size_t alignment)
+{
+    (void)user, (void)bytes, (void)alignment;
+    return NULL;
+}
+
+static void no_free(void *user, void *pointer, size_t bytes) { (void)user, (void)pointer, (void)bytes; }
+
 TEST(a_refused_context_tells_its_logger)
 {
     log_notes n;
@@ -554,6 +562,16 @@ TEST(a_refused_context_tells_its_logger)
     CHECK_EQUAL(1, n.count);
     CHECK_TEXT("workers is -3", n.text);
     dist_context_destroy(ctx);
+    desc.workers = 1; /* and where there is none to keep the sentence */
+    desc.allocator.alloc_fn = no_memory;
+    CHECK(dist_context_create(&desc) == NULL);
+    CHECK_EQUAL(2, n.count);
+    CHECK_EQUAL(DIST_BAD_ARGUMENT, n.last);
+    CHECK_TEXT("free_fn is NULL", n.text);
+    desc.allocator.free_fn = no_free;
+    CHECK(dist_context_create(&desc) == NULL);
+    CHECK_EQUAL(3, n.count);
+    CHECK_EQUAL(DIST_OUT_OF_MEMORY, n.last);
 }
 
 TEST(objects_of_another_context_are_refused)

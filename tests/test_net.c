@@ -1083,8 +1083,42 @@ TEST(metadata_that_means_nothing_is_refused_with_a_sentence)
     }
     REFUSED(DIST_BAD_FILE, "layer 0 takes 5", "\"dist.code_size\":\"3\"", good_tensors);
     REFUSED(DIST_BAD_FILE, "4 wide", "\"dist.skip\":\"1\"", good_tensors);
+    char list[40 + 2 * 40] = "\"dist.skip\":\""; /* more layers than there can be */
+    for (int k = 0; k < 40; k++) strcat(list, "1,");
+    strcat(list, "\"");
+    REFUSED(DIST_BAD_FILE, "dist.skip", list, good_tensors);
     REFUSED(DIST_BAD_FILE, "dist.encoding.levels", "\"dist.encoding\":\"fourier\",\"dist.encoding.raw\":\"0\"",
             good_tensors);
+}
+
+/* 15 digits, as of old, do not hold a double; pi is the default. */
+TEST(the_base_of_an_encoding_is_saved_to_the_last_bit)
+{
+    static const char *const bases[] = {NULL, "9.783935319462859e-6", "9.7866019443823492e-05", "2", "0.1", "1e6",
+                                        "499553.45723394846", "0.33333333333333331"};
+    for (size_t k = 0; k < sizeof bases / sizeof bases[0]; k++) {
+        char meta[160];
+        size_t size[3];
+        dist_context *ctx = test_context();
+        snprintf(meta, sizeof meta, "\"dist.encoding\":\"fourier\",\"dist.encoding.levels\":\"1\"%s%s%s",
+                 bases[k] ? ",\"dist.encoding.base\":\"" : "", bases[k] ? bases[k] : "", bases[k] ? "\"" : "");
+        unsigned char *bytes = file_of(meta, "lin0.weight 1 9;lin0.bias 1;", "F32", -1, 0.0f, &size[0]);
+        dist_net *net = dist_net_load(ctx, bytes, size[0]);
+        REQUIRE(net != NULL);
+        unsigned char *first = saved(ctx, net, &size[1]);
+        dist_net *again = dist_net_load(ctx, first, size[1]);
+        REQUIRE(again != NULL);
+        unsigned char *second = saved(ctx, again, &size[2]);
+        const double base = bases[k] ? strtod(bases[k], NULL) : 3.14159265358979323846;
+        CHECK(net->base == base && again->base == base);
+        CHECK(size[1] == size[2] && memcmp(first, second, size[1]) == 0);
+        dist_net_destroy(again);
+        dist_net_destroy(net);
+        free(bytes);
+        free(first);
+        free(second);
+        dist_context_destroy(ctx);
+    }
 }
 
 TEST(weights_that_are_not_finite_and_unknown_types_are_refused)
@@ -1461,6 +1495,7 @@ int main(int argc, char **argv)
     RUN(a_layer_missing_in_the_middle_is_refused);
     RUN(a_net_of_more_layers_than_there_can_be_is_refused);
     RUN(metadata_that_means_nothing_is_refused_with_a_sentence);
+    RUN(the_base_of_an_encoding_is_saved_to_the_last_bit);
     RUN(weights_that_are_not_finite_and_unknown_types_are_refused);
     RUN(a_file_cut_short_anywhere_is_refused);
     RUN(null_handles_are_refused);

@@ -310,13 +310,17 @@ static void random_how(test_random *r, scene *s)
     how->gradient = test_random_int(r, 0, DIST_GRADIENT_PAPER);
     how->gradient_cap = one_in(r, 3) ? (float)log_uniform(r, -9, 0) : 0;
     how->normal_mode = test_random_int(r, 0, 1);
-    how->normal_delta = one_in(r, 3) ? (float)(log_uniform(r, -8, 0) * s->radius) : 0;
+    how->normal_delta = one_in(r, 3) ? (float)(log_uniform(r, -3, -0.3) * s->radius) : 0;
     how->normal_space = test_random_int(r, 0, 1);
     how->inside = test_random_int(r, 0, 2);
     how->background = one_in(r, 3) ? (float)log_uniform(r, -6, 11) : 0;
     how->no_cones = one_in(r, 4);
     how->no_prediction = one_in(r, 4);
     how->certified = one_in(r, 4);
+    if (how->trace == DIST_TRACE_PAPER) { /* has neither */
+        how->certified = 0;
+        how->inside %= DIST_INSIDE_EXIT;
+    }
     if (one_in(r, 4))
         how->max_queries = (unsigned long long)(log_uniform(r, -1, 2) * s->camera.width * s->camera.height);
     if (one_in(r, 6)) {

@@ -310,7 +310,7 @@ static void random_how(test_random *r, scene *s)
     how->gradient = test_random_int(r, 0, DIST_GRADIENT_PAPER);
     how->gradient_cap = one_in(r, 3) ? (float)log_uniform(r, -9, 0) : 0;
     how->normal_mode = test_random_int(r, 0, 1);
-    how->normal_delta = one_in(r, 3) ? (float)(log_uniform(r, -3, -0.3) * s->radius) : 0;
+    how->normal_delta = one_in(r, 3) ? (float)(log_uniform(r, -5, -0.3) * s->radius) : 0;
     how->normal_space = test_random_int(r, 0, 1);
     how->inside = test_random_int(r, 0, 2);
     how->background = one_in(r, 3) ? (float)log_uniform(r, -6, 11) : 0;
@@ -658,6 +658,8 @@ static int scene_render(const scene *s, stage *where, planes *p, pulls *g, scene
     make_field(ctx, s, own, &m);
     if (s->bad == BAD_POSE) *(scene_now & 1 ? camera.rotation + 4 : camera.translation + 1) = not_a_number(s);
     if (s->bad == BAD_INTRINSIC) *(scene_now & 1 ? &camera.fx : &camera.cy) = not_a_number(s);
+    if (how.normal_delta > 0 && test_finite((double)m.placed.radius)) /* scenes are of other sizes than their parts */
+        how.normal_delta = fminf(fmaxf(how.normal_delta, 2e-6f * m.placed.radius), 0.5f * m.placed.radius);
     if (s->bad == BAD_SETTING) *(scene_now & 1 ? &how.epsilon : &how.step_scale) = not_a_number(s);
     dist_tape *tape = s->planes & 64 ? NULL : dist_tape_create(ctx, &camera, &how);
     size_t requests = where->memory.requests;

@@ -506,6 +506,7 @@ enum {
     DIST_RAY_SKIPPED     /* not asked for (how.pixels): mask 0, silhouette 0, no query, no gradient */
 };
 
+/* `how` in comments and messages. */
 typedef struct dist_render_desc {
     int max_steps;       /* queries per ray at most, to 60000; 0: 100 guarded, 10000 certified, 50 paper */
     float step_scale;    /* alpha, above 0, to 100; 0: 1.5 (paper: rows aggressive and coarse-to-fine) */
@@ -585,7 +586,7 @@ typedef struct dist_hit {
 /* Traces n rays (origins (n, 3), directions (n, 3) of any length from 1.2e-38 on) with the guarded tracer: picking,
    shadows, visibility. The first surface in front of each origin; with how.any_hit any of them. A ray that is 0 or not
    finite is DIST_RAY_NOT_FINITE. No cone and no neighbor helps a free ray to see what is thin: with how.certified it
-   asks more, and steps over nothing as far as the Lipschitz figures are bounds. */
+   asks more, and steps over nothing as far as the Lipschitz figures are bounds. stats may be NULL. */
 DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size_t n, const float *origins,
                                 const float *directions, const dist_render_desc *how, dist_hit *hits,
                                 dist_stats *stats);
@@ -868,8 +869,8 @@ typedef struct dist_workspace_desc {
    DIST_OUT_OF_MEMORY. The create functions' own code is run without memory. dist_net_load_file needs its file's bytes
    besides, meshes and Chamfer distance theirs.
    0: a create function would refuse (but for what only tensors' numbers, types and biases tell, which are not looked
-   at); desc->context->logger is told why. The table of contents of a model is read into
-   memory of desc->context->allocator, or malloc's, and given back. */
+   at); desc->context->logger is told why. The table of contents of a model is read into memory of
+   desc->context->allocator, or malloc's, and given back: that allocator is not the arena that is still to be made. */
 DIST_API size_t dist_workspace_bytes(const dist_workspace_desc *desc);
 
 #ifdef __cplusplus

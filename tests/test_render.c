@@ -351,6 +351,59 @@ TEST(silhouette_of_misses_is_the_smallest_f_on_92_of_100)
     check_silhouette(10, 8);
 }
 
+static double box_along(const float box[6], const float o[3], const float d[3], double t)
+{
+    double square = 0, inside = -1e30;
+    for (int i = 0; i < 3; i++) {
+        double off = fabs((double)o[i] + t * (double)d[i] - (double)box[i]) - (double)box[3 + i];
+        inside = fmax(inside, off);
+        square += off > 0 ? off * off : 0;
+    }
+    return square > 0 ? sqrt(square) : inside;
+}
+
+/* Beside an edge f falls in a straight line along the ray, then has its least where the ray passes the edge's middle:
+   what neighbors say is short of that. f is convex along rays, so that golden sections find it. */
+TEST(silhouette_of_a_box_is_the_smallest_f_along_its_edges)
+{
+    enum { W = 384, H = 288 };
+    static float silhouette[W * H];
+    static unsigned char mask[W * H];
+    float box[6] = {0.1f, 0, 0, 0.4f, 0.5f, 0.3f}, eye[3] = {1.4f, 1, 2}, at[3] = {0, 0, 0}, up[3] = {0, 1, 0};
+    dist_context *ctx = test_context();
+    dist_field field = dist_field_box(box);
+    for (int size = 1; size <= 4; size *= 2) {
+        dist_camera camera = dist_camera_look_at(W / size, H / size, 0.8f, eye, at, up);
+        dist_images out;
+        int misses = 0, off = 0;
+        double worst = 0;
+        memset(&out, 0, sizeof out);
+        out.silhouette = silhouette;
+        out.mask = mask;
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, NULL), ctx);
+        for (int i = 0; i < camera.width * camera.height; i++) {
+            float o[3], d[3];
+            double low = 1, high = 5;
+            dist_camera_ray(&camera, (float)(i % camera.width), (float)(i / camera.width), o, d);
+            for (int k = 0; k < 60; k++) {
+                double u = low + 0.382 * (high - low), v = low + 0.618 * (high - low);
+                if (box_along(box, o, d, u) < box_along(box, o, d, v)) high = v;
+                else low = u;
+            }
+            double least = box_along(box, o, d, 0.5 * (low + high)), far = fabs(least - (double)silhouette[i]);
+            if (mask[i] || least > 0.03) continue;
+            misses++;
+            off += far > 1e-3;
+            worst = fmax(worst, far);
+        }
+        int good = CHECK(misses > 100) & CHECK(off * 200 <= misses);
+        if (!good || test_state.verbose)
+            printf("    %d x %d: %d of %d misses off by more than 1e-3, worst %.1e\n", camera.width, camera.height, off,
+                   misses, worst);
+    }
+    dist_context_destroy(ctx);
+}
+
 static void clamped_ball(void *user, int worker, size_t n, const float *p, float *sdf, float *gradient)
 {
     (void)user, (void)worker;
@@ -1503,6 +1556,7 @@ int main(int argc, char **argv)
     RUN(a_surface_without_slope_has_normal_zero_or_unit_and_nothing_is_nan);
     RUN(silhouette_near_the_outline_is_the_smallest_f_on_98_of_100);
     RUN(silhouette_of_misses_is_the_smallest_f_on_92_of_100);
+    RUN(silhouette_of_a_box_is_the_smallest_f_along_its_edges);
     RUN(silhouette_of_a_clamped_field_is_seen_from_the_plateau);
     RUN(silhouette_off_the_sphere_is_the_distance_to_it);
     RUN(a_smaller_picture_asks_for_less);

@@ -465,9 +465,9 @@ typedef struct dist_camera {
 } dist_camera;
 
 /* fx = fy = height / 2 / tan(fov_y / 2), cx = (width - 1) / 2, cy = (height - 1) / 2, pixel centers at integers.
-   Degenerate input (eye = at, up along the view or NULL) is repaired by choosing another up; what cannot be repaired,
-   such as fov_y in degrees, eye or at NULL or not finite, makes fx 0, which the function that takes the camera
-   refuses. */
+   eye and at: NULL is the origin. Degenerate input (eye = at, up along the view or NULL) is repaired by another up;
+   what cannot be repaired, such as fov_y in degrees or what is not finite, makes fx 0, which the function that takes
+   the camera refuses. */
 DIST_API dist_camera dist_camera_look_at(int width, int height, float fov_y /* radians, above 0, below pi */,
                                          const float eye[3], const float at[3], const float up[3]);
 /* camera_to_world: row-major 3 x 4 or the upper part of 4 x 4, x right, y up, z backward (OpenGL, Blender, NeRF). */
@@ -492,7 +492,8 @@ enum { DIST_PAPER_COARSE_TO_FINE = 0, DIST_PAPER_AGGRESSIVE, DIST_PAPER_DYNAMIC,
 enum { DIST_GRADIENT_AUTO = 0, DIST_GRADIENT_IMPLICIT, DIST_GRADIENT_NORMAL, DIST_GRADIENT_PAPER };
 enum { DIST_NORMAL_ANALYTIC = 0, DIST_NORMAL_DIFFERENCE = 1 };
 enum { DIST_SPACE_CAMERA = 0, DIST_SPACE_WORLD = 1 };
-/* Of a ray that starts in the solid: no hit; a hit at its start; what it meets on its way out (guarded tracer). */
+/* Of a ray that starts in the solid: no hit; a hit at its start; where it leaves the solid (with DIST_TRACE_PAPER: no
+   hit). */
 enum { DIST_INSIDE_BACKGROUND = 0, DIST_INSIDE_HIT = 1, DIST_INSIDE_EXIT = 2 };
 
 enum {
@@ -9296,7 +9297,7 @@ DIST_API dist_camera dist_camera_look_at(int width, int height, float fov_y, con
         camera.fx = camera.fy = (float)(height / 2.0 / tan((double)fov_y / 2.0));
     camera.cx = (float)((width - 1.0) / 2.0);
     camera.cy = (float)((height - 1.0) / 2.0);
-    if (!eye || !disti_finite_all(3, eye) || !at || !disti_finite_all(3, at) || (up && !disti_finite_all(3, up)))
+    if ((eye && !disti_finite_all(3, eye)) || (at && !disti_finite_all(3, at)) || (up && !disti_finite_all(3, up)))
         camera.fx = 0.0f;
     for (int i = 0; i < 3; i++) {
         center[i] = eye ? (double)eye[i] : 0.0;
@@ -9506,8 +9507,6 @@ static dist_status disti_how_check(dist_context *ctx, const dist_render_desc *ho
         return disti_refuse(ctx, "%s: how.warm_start is for DIST_TRACE_GUARDED, must be 0", function);
     if (how->certified && how->trace != DIST_TRACE_GUARDED)
         return disti_refuse(ctx, "%s: how.certified is for DIST_TRACE_GUARDED, must be 0", function);
-    if (how->inside == DIST_INSIDE_EXIT && how->trace != DIST_TRACE_GUARDED)
-        return disti_refuse(ctx, "%s: how.inside DIST_INSIDE_EXIT is for DIST_TRACE_GUARDED", function);
     if (!disti_finite(how->background))
         return disti_fail(ctx, DIST_NOT_FINITE, "%s: how.background is %d, must be finite", function,
                           (double)how->background, 0);

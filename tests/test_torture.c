@@ -317,10 +317,7 @@ static void random_how(test_random *r, scene *s)
     how->no_cones = one_in(r, 4);
     how->no_prediction = one_in(r, 4);
     how->certified = one_in(r, 4);
-    if (how->trace == DIST_TRACE_PAPER) { /* has neither */
-        how->certified = 0;
-        how->inside %= DIST_INSIDE_EXIT;
-    }
+    how->certified &= how->trace == DIST_TRACE_GUARDED;
     if (one_in(r, 4))
         how->max_queries = (unsigned long long)(log_uniform(r, -1, 2) * s->camera.width * s->camera.height);
     if (one_in(r, 6)) {

@@ -4398,7 +4398,7 @@ static void disti_backward_seed(void *user, size_t first, size_t count, const fl
     if (job->seed_fn && job->d_sdf) memcpy(job->d_sdf + at, d_sdf, count * sizeof(float));
     if (!job->d_points || !gradient) return;
     for (float *d = job->d_points + 3 * at; count > 0; count--, d += 3, gradient += 3, d_sdf++) {
-        if (!disti_finite(*d_sdf)) continue; /* nor does the code take it */
+        if (!disti_finite(*d_sdf)) continue;
         d[0] += *d_sdf * gradient[0];
         d[1] += *d_sdf * gradient[1];
         d[2] += *d_sdf * gradient[2];
@@ -7723,7 +7723,8 @@ static void disti_weights_block(void *arg, int index, int worker)
     size_t columns = job->directions ? (size_t)DISTI_BLOCK : count, channels = job->d_color ? 3 : 1;
     if (disti_weights_huge(shape, columns, channels, store))
         disti_weights_drop(net, columns, channels, store);
-    for (size_t i = 0; job->d_points && i < 3 * count; i++) job->d_points[3 * at + i] += b.pull[i];
+    for (size_t i = 0; job->d_points && i < 3 * count; i++)
+        if (disti_finite(b.pull[i])) job->d_points[3 * at + i] += b.pull[i];
     if (!job->d_code) return;
     disti_fold_begin(net, &b);
     disti_fold_sum(shape, &b, NULL, 0);
@@ -12278,7 +12279,7 @@ static void disti_silhouette(const disti_tracer *tracer, int worker, const disti
                 if (disti_silhouette_node(tile, x, y, h) && disti_wants_minimum(&bench->rays[y * w + x]))
                     count = disti_silhouette_place(tracer, tile, bench, x, y, h, enough, count);
         disti_silhouette_take(tracer, worker, bench, count);
-        for (size_t k = 0; k < count && h < DISTI_NODE; k++) { /* where f is larger than foretold, the minimum is not */
+        for (size_t k = 0; k < count && h < DISTI_NODE; k++) { /* f larger than foretold: the least is elsewhere */
             disti_ray *ray = &bench->rays[bench->index[k]];
             int looks = ray->fbest > near && ray->fbest < far; /* nearer ones do in any case */
             if (looks && ray->fbest > 1.2f * ray->fb + 5e-4f * radius) ray->width = 0.35f;

@@ -1449,6 +1449,40 @@ TEST(a_zero_upstream_gradient_costs_no_point)
     }
 }
 
+TEST(a_seed_that_is_not_finite_gives_nothing_to_point_code_or_weights)
+{
+    static const uint32_t wrong[3] = {0x7fc00000u, 0x7f800000u, 0xff800000u};
+    dist_context *ctx = test_context();
+    dist_net_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.layers = 3, desc.width = 16, desc.code_size = 4, desc.seed = 1;
+    dist_net *net = dist_net_create(ctx, &desc);
+    dist_shape *shape = dist_shape_create(ctx, net, NULL);
+    REQUIRE(shape != NULL && dist_net_weight_count(net) <= 1000);
+    dist_field field = dist_shape_field(shape);
+    const float p[9] = {0.1f, 0.2f, 0.3f, 0.4f, 0.1f, 0, -0.2f, 0.3f, 0.1f};
+    for (int k = 0; k < 6; k++) { /* for the code alone, then for the weights too */
+        float seed[3] = {1, 0, 2}, d_points[2][9] = {{0}}, code[2][4] = {{0}};
+        static float weights[2][1000];
+        memset(weights, 0, sizeof weights);
+        for (int bad = 0; bad < 2; bad++) {
+            dist_gradients grads;
+            memset(&grads, 0, sizeof grads);
+            grads.code = code[bad];
+            grads.weights = k < 3 ? NULL : weights[bad];
+            if (bad) memcpy(seed + 1, &wrong[k % 3], sizeof *seed);
+            CHECK_STATUS(DIST_OK, dist_field_backward(ctx, &field, 3, p, seed, NULL, NULL, d_points[bad], &grads), ctx);
+        }
+        for (int i = 0; i < 9; i++) CHECK(d_points[0][i] == d_points[1][i]);
+        for (int i = 0; i < 4; i++) CHECK(test_finite((double)code[1][i]));
+        for (int i = 0; i < 1000; i++) CHECK(test_finite((double)weights[1][i]));
+        CHECK(d_points[1][0] != 0 && d_points[1][6] != 0 && d_points[1][3] == 0);
+    }
+    dist_shape_destroy(shape);
+    dist_net_destroy(net);
+    dist_context_destroy(ctx);
+}
+
 TEST(an_upstream_gradient_that_is_not_finite_counts_as_zero)
 {
     for (int k = 0; k < 3; k++) {
@@ -2065,6 +2099,7 @@ int main(int argc, char **argv)
     RUN(a_boxs_pose_is_recovered_from_12_degrees_off);
     RUN(a_lens_is_recovered_from_a_tenth_off);
     RUN(a_zero_upstream_gradient_costs_no_point);
+    RUN(a_seed_that_is_not_finite_gives_nothing_to_point_code_or_weights);
     RUN(an_upstream_gradient_that_is_not_finite_counts_as_zero);
     RUN(an_upstream_gradient_that_overflows_is_left_out_and_counted);
     RUN(gradients_are_added_to_what_is_there);

@@ -9432,7 +9432,7 @@ typedef struct disti_ray {
     unsigned char mode, status;
     unsigned char known; /* marching: the slope is measured */
     unsigned char side;  /* bracket, band: queries in it so far; marching: steps since a sample beyond was negative */
-    unsigned char moved; /* band: 1 if the ray came into it from outside */
+    unsigned char moved; /* band: 1 if the ray came into it from outside; silhouette: DISTI_UNSURE and so on, or 0 */
     unsigned char aim;   /* 1: the neighbors predict the hit at target, 2: but not how f falls there */
     float target, incline; /* s, df/ds there; bracket: disti_ray_bent, and its own */
     float off;             /* of a hit: how far the neighbors' prediction was from it; 0: there was none */
@@ -12081,6 +12081,12 @@ static void disti_coarse_doubt(const disti_tracer *tracer, const disti_tile *til
    so large that the nodes do, it is interpolated as well (none): what that is off by goes with the square of the nodes'
    distance over f. Near the outline a pixel also looks where its neighbors' minima are, and fits a parabola. A value
    off by ds costs ds^2 / 2 times the curvature: first-order exact (envelope theorem). */
+enum {
+    DISTI_FITTED = 1, /* its parabola has been made */
+    DISTI_UNSURE,     /* beside hits: its nodes do not foretell its f; waits for neighbors nearer to the outline */
+    DISTI_FORETOLD    /* they do, in this round */
+};
+
 static int disti_wants_minimum(const disti_ray *ray)
 {
     return ray->status == DIST_RAY_MISS && ray->enter < ray->leave && !ray->kept;
@@ -12176,6 +12182,7 @@ static size_t disti_silhouette_parabolas(const disti_tracer *tracer, int worker,
             }
             float least = disti_parabola(width, left, ray->fa, right);
             kept = disti_silhouette_ask(bench, index, ray->a + least, kept);
+            ray->moved = DISTI_FITTED;
         }
         disti_silhouette_take(tracer, worker, bench, kept);
     }
@@ -12260,16 +12267,29 @@ static size_t disti_silhouette_place(const disti_tracer *tracer, const disti_til
     return count;
 }
 
-static void disti_silhouette(const disti_tracer *tracer, int worker, const disti_tile *tile, const disti_bench *bench)
+/* The neighbor of ray `index`, k = 0 to 3: right, left, below, above; NULL beyond the tile. */
+static const disti_ray *disti_ray_beside(const disti_tile *tile, const disti_bench *bench, int index, int k)
+{
+    int x = index % tile->width + (k == 0) - (k == 1), y = index / tile->width + (k == 2) - (k == 3);
+    int beyond = x < 0 || y < 0 || x >= tile->width || y >= tile->height;
+    return beyond ? NULL : &bench->rays[y * tile->width + x];
+}
+
+static int disti_ray_beside_hit(const disti_tile *tile, const disti_bench *bench, int index)
+{
+    for (int k = 0; k < 4; k++) {
+        const disti_ray *other = disti_ray_beside(tile, bench, index, k);
+        if (other && other->status == DIST_RAY_HIT) return 1;
+    }
+    return 0;
+}
+
+/* Nodes, and what they say of the rays between them. From f = far on the rays of every 4th pixel do for all others. */
+static void disti_silhouette_nodes(const disti_tracer *tracer, int worker, const disti_tile *tile,
+                                   const disti_bench *bench, float near, float far, float plateau)
 {
     int n = tile->width * tile->height, w = tile->width;
-    float radius = tracer->field->radius, clamp = tracer->field->clamp;
-    float pixel = disti_pixel_width(tracer, tile);
-    /* where f between nodes, of curvature 1 / f, is off by about (4 pixels)^2 / 8 f = 1e-3 radii */
-    float plateau = clamp > 0.0f ? 0.98f * clamp : 3e38f;
-    float far = DISTI_MIN(DISTI_MAX(0.05f, 1.5e3f * (pixel / radius) * (pixel / radius)) * radius, plateau);
-    float near = pixel > 0.01f * radius ? 0.5f * far : 0.005f * radius; /* coarse pixels have less to share */
-    for (int i = 0; i < n; i++) bench->rays[i].width = 0.0f;
+    float radius = tracer->field->radius;
     for (int h = 2 * DISTI_NODE; h >= 1; h /= 2) {
         /* from this f on nodes 2 h apart do for what lies between them; that of a plateau is all the same */
         float apart = 2.0f * (float)h / (float)DISTI_NODE, enough = DISTI_MIN(apart * apart * far, plateau);
@@ -12281,45 +12301,128 @@ static void disti_silhouette(const disti_tracer *tracer, int worker, const disti
         disti_silhouette_take(tracer, worker, bench, count);
         for (size_t k = 0; k < count && h < DISTI_NODE; k++) { /* f larger than foretold: the least is elsewhere */
             disti_ray *ray = &bench->rays[bench->index[k]];
-            int looks = ray->fbest > near && ray->fbest < far; /* nearer ones do in any case */
-            if (looks && ray->fbest > 1.2f * ray->fb + 5e-4f * radius) ray->width = 0.35f;
+            if (!(ray->fbest > near && ray->fbest < far)) continue; /* nearer ones are fitted in any case */
+            if (!(ray->fb > 0.0f)) ray->moved = DISTI_UNSURE;
+            else if (ray->fbest > 1.2f * ray->fb + 5e-4f * radius) ray->width = 0.35f;
         }
-        if (h < DISTI_NODE) disti_silhouette_fit(tracer, worker, bench, n);
-        if (h < DISTI_NODE) continue;
         for (int i = 0; i < n; i++)
             if (h == DISTI_NODE && bench->rays[i].fbest > far) bench->rays[i].width = 0.0f;
         disti_silhouette_fit(tracer, worker, bench, n);
-        if (h == DISTI_NODE) continue;
-        for (int i = 0; i < n; i++) /* the cones' samples are far apart: once more */
-            if (disti_silhouette_node(tile, i % w, i / w, h) && disti_wants_minimum(&bench->rays[i]) &&
-                bench->rays[i].fbest < DISTI_MIN(4.0f * far, plateau))
-                bench->rays[i].width = 0.35f;
+        if (h <= DISTI_NODE) continue;
+        for (int i = 0; i < n; i++) { /* the cones' samples are far apart: where that helped, once more */
+            disti_ray *ray = &bench->rays[i];
+            if (!disti_silhouette_node(tile, i % w, i / w, h) || !disti_wants_minimum(ray)) continue;
+            if (ray->moved == DISTI_FITTED && ray->best == ray->a) continue;
+            if (ray->fbest < DISTI_MIN(4.0f * far, plateau)) ray->width = 0.35f;
+        }
         disti_silhouette_fit(tracer, worker, bench, n);
     }
-    for (int round = 0; round < 2; round++) {
+}
+
+/* Rays also look where their neighbors' least samples are. */
+static void disti_silhouette_look(const disti_tracer *tracer, int worker, const disti_tile *tile,
+                                  const disti_bench *bench, float limit)
+{
+    int n = tile->width * tile->height;
+    float radius = tracer->field->radius;
+    size_t count = 0;
+    for (int i = 0; i < n; i++) {
+        disti_ray *ray = &bench->rays[i];
+        const disti_ray *best = ray;
+        if (!disti_wants_minimum(ray) || ray->fbest > limit) continue;
+        for (int k = 0; k < 4; k++) {
+            const disti_ray *other = disti_ray_beside(tile, bench, i, k);
+            if (other && disti_has_minimum(other) && other->fbest < best->fbest) best = other;
+        }
+        float away = disti_ray_distance(best) - disti_ray_distance(ray);
+        if (!(away * away > 4e-4f * radius * radius)) continue;
+        if (ray->moved == DISTI_FITTED) ray->moved = 0;
+        count = disti_silhouette_ask(bench, i, (float)((double)disti_ray_distance(best) - ray->base), count);
+    }
+    disti_silhouette_take(tracer, worker, bench, count);
+}
+
+/* What the neighbors nearer to the outline, one or two, say of an unsure ray: with the pixel between them they span a
+   plane, at a straight edge of the shape the truth. Returns 0 if there is none. */
+static int disti_silhouette_foretell(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench,
+                                     int index, float *t, float *f)
+{
+    const disti_ray *ray = &bench->rays[index], *inner[2] = {NULL, NULL};
+    for (int k = 0; k < 4; k++) {
+        const disti_ray *other = disti_ray_beside(tile, bench, index, k), *known = inner[k / 2];
+        if (!other || !disti_has_minimum(other) || other->moved >= DISTI_UNSURE || other->fbest > ray->fbest) continue;
+        if (!known || other->fbest < known->fbest) inner[k / 2] = other;
+    }
+    if (!inner[0] && !inner[1]) return 0;
+    const disti_ray *least = !inner[1] || (inner[0] && inner[0]->fbest < inner[1]->fbest) ? inner[0] : inner[1];
+    *t = disti_ray_distance(least);
+    *f = least->fbest + 1.4f * ray->footprint * *t; /* 0.7 pixels */
+    if (!inner[0] || !inner[1]) return 1;
+    const disti_ray *between = inner[0] + (inner[1] - ray);
+    if (!disti_has_minimum(between) || between->moved >= DISTI_UNSURE) return 1;
+    float far = 0.1f * tracer->field->radius, base = disti_ray_distance(between);
+    float u = disti_ray_distance(inner[0]) - base, v = disti_ray_distance(inner[1]) - base;
+    if (DISTI_MAX(u * u, v * v) > far * far) return 1; /* of another part of the shape */
+    *t = base + u + v;
+    *f = DISTI_MAX(inner[0]->fbest + inner[1]->fbest - between->fbest, 0.0f);
+    return 1;
+}
+
+/* The unsure rays, from the outline outward: asked for where the neighbors say (1 query), fitted where f is larger than
+   they say. Those that no neighbor tells anything of are fitted. */
+static void disti_silhouette_sweep(const disti_tracer *tracer, int worker, const disti_tile *tile,
+                                   const disti_bench *bench)
+{
+    int n = tile->width * tile->height, unsure = 1;
+    while (unsure) {
         size_t count = 0;
+        int told = 0;
+        unsure = 0;
         for (int i = 0; i < n; i++) {
             disti_ray *ray = &bench->rays[i];
-            const disti_ray *best = ray;
-            if (!disti_wants_minimum(ray) || ray->fbest > (round == 0 ? far : near)) continue;
-            for (int k = 0; k < 4; k++) {
-                int x = i % w + (k == 0) - (k == 1), y = i / w + (k == 2) - (k == 3);
-                if (x < 0 || y < 0 || x >= w || y >= tile->height) continue;
-                const disti_ray *other = &bench->rays[y * w + x];
-                if (disti_has_minimum(other) && other->fbest < best->fbest) best = other;
-            }
-            float away = disti_ray_distance(best) - disti_ray_distance(ray);
-            if (away * away > 4e-4f * radius * radius)
-                count = disti_silhouette_ask(bench, i, (float)((double)disti_ray_distance(best) - ray->base), count);
+            float t = 0.0f;
+            if (ray->moved != DISTI_UNSURE) continue;
+            unsure++;
+            if (!disti_silhouette_foretell(tracer, tile, bench, i, &t, &ray->fb)) continue;
+            told++;
+            ray->moved = DISTI_FORETOLD;
+            float away = t - disti_ray_distance(ray), near = 0.1f * ray->fbest, s = (float)((double)t - ray->base);
+            if (away * away > near * near) count = disti_silhouette_ask(bench, i, s, count);
         }
         disti_silhouette_take(tracer, worker, bench, count);
-    }
-    for (int fine = 0; fine <= (pixel > 0.01f * radius); fine++) {
-        for (int i = 0; i < n; i++)
-            if (disti_wants_minimum(&bench->rays[i]) && bench->rays[i].fbest < near)
-                bench->rays[i].width = fine ? 0.1f : 0.35f;
+        for (int i = 0; i < n && unsure; i++) {
+            disti_ray *ray = &bench->rays[i];
+            int wrong = ray->fbest > 1.1f * ray->fb + 5e-4f * tracer->field->radius;
+            if (ray->moved < DISTI_UNSURE || (told && ray->moved == DISTI_UNSURE)) continue;
+            if (wrong || ray->moved == DISTI_UNSURE) ray->width = 0.35f;
+            ray->moved = 0;
+        }
         disti_silhouette_fit(tracer, worker, bench, n);
     }
+}
+
+static void disti_silhouette(const disti_tracer *tracer, int worker, const disti_tile *tile, const disti_bench *bench)
+{
+    int n = tile->width * tile->height;
+    float radius = tracer->field->radius, clamp = tracer->field->clamp;
+    float pixel = disti_pixel_width(tracer, tile);
+    /* where f between nodes, of curvature 1 / f, is off by about (4 pixels)^2 / 8 f = 1e-3 radii */
+    float plateau = clamp > 0.0f ? 0.98f * clamp : 3e38f;
+    float far = DISTI_MIN(DISTI_MAX(0.05f, 1.5e3f * (pixel / radius) * (pixel / radius)) * radius, plateau);
+    float near = pixel > 0.01f * radius ? 0.5f * far : 0.005f * radius; /* coarse pixels have less to share */
+    for (int i = 0; i < n; i++) bench->rays[i].width = 0.0f, bench->rays[i].moved = 0;
+    disti_silhouette_nodes(tracer, worker, tile, bench, near, far, plateau);
+    disti_silhouette_look(tracer, worker, tile, bench, far);
+    disti_silhouette_look(tracer, worker, tile, bench, near);
+    for (int fine = 0; fine <= (pixel > 0.01f * radius); fine++) {
+        for (int i = 0; i < n; i++) {
+            disti_ray *ray = &bench->rays[i];
+            if (!disti_wants_minimum(ray) || ray->fbest > far || (ray->moved == DISTI_FITTED && !fine)) continue;
+            if (ray->fbest < near || disti_ray_beside_hit(tile, bench, i)) ray->width = fine ? 0.1f : 0.35f;
+        }
+        disti_silhouette_fit(tracer, worker, bench, n);
+    }
+    disti_silhouette_sweep(tracer, worker, tile, bench);
 }
 
 #ifndef DIST_NO_PAPER

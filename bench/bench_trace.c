@@ -47,9 +47,9 @@ enum { CASES = sizeof cases / sizeof cases[0], FIRST_SHORT = 3 };
 
 static void print_result(const char *name, const method *m, int size, const result *r)
 {
-    printf("%s,%s,%d,%.2g,%llu,%.4f,%.0f,%.2e,%.2e,%.2e,%.0f,%.0f", name, m->name, size, (double)r->stats.epsilon,
+    printf("%s,%s,%d,%.2g,%llu,%.4f,%.0f,%.2e,%.2e,%.2e,%.0f,%.0f,%llu", name, m->name, size, (double)r->stats.epsilon,
            r->stats.queries, r->seconds, (double)r->hits, r->mean, r->p99, r->largest, (double)r->holes,
-           (double)r->false_hits);
+           (double)r->false_hits, r->silhouette_queries);
 }
 
 /* All methods on one field. scaled: queries where the parallel row has the paper's 6.06 million. */
@@ -125,7 +125,8 @@ int main(int argc, char **argv)
         }
     }
     dist_context *ctx = dist_context_create(NULL);
-    printf("case,method,resolution,epsilon,queries,seconds,hits,mean_error,p99_error,max_error,holes,false_hits%s\n",
+    printf("case,method,resolution,epsilon,queries,seconds,hits,mean_error,p99_error,max_error,holes,false_hits,"
+           "silhouette_queries%s\n",
            ladder_of ? ",scaled_queries,paper_queries" : "");
     if (ladder_of) {
         dist_shape *shape = NULL;

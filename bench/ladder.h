@@ -214,6 +214,7 @@ typedef struct result {
     dist_stats stats;
     double seconds, mean, p99, largest;
     size_t hits, holes, false_hits;
+    unsigned long long silhouette_queries; /* more with a silhouette */
 } result;
 
 /* A false hit is one where the reference stays farther than 5e-5 from the surface; rays that start inside do not
@@ -261,8 +262,16 @@ static inline result trace_once(dist_context *ctx, const dist_field *field, cons
     } while (count < REPETITIONS && seconds[0] < 2.0);
     r.seconds = median(count, seconds);
     compare(ref, out.distance, out.mask, &r);
+    dist_stats more;
+    memset(&more, 0, sizeof more);
+    out.stats = &more;
+    out.silhouette = take_floats(ref->n);
+    dist_render(ctx, field, camera, how, &out, NULL);
+    check(ctx);
+    r.silhouette_queries = more.queries - r.stats.queries;
     free(out.distance);
     free(out.mask);
+    free(out.silhouette);
     return r;
 }
 

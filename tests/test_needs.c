@@ -72,6 +72,43 @@ TEST(instances_out_of_view_cost_nothing)
     CHECK_NEAR(stats_of(NEED_DEPTH)->hits, stats_of(NEED_TEN)->hits, 3); /* outlines: another sphere is entered */
 }
 
+/* At 512 x 512 from bench_camera. */
+static void check_silhouette(const char *model, int code)
+{
+    enum { SIDE = 512 };
+    static float depth[SIDE * SIDE], silhouette[SIDE * SIDE];
+    dist_context *ctx = test_context();
+    dist_net *net = load_net_or_skip(ctx, model);
+    if (!net) {
+        dist_context_destroy(ctx);
+        SKIP("the real decoders are not here");
+    }
+    dist_shape *shape = dist_shape_create(ctx, net, dist_net_code(net, code));
+    dist_field field = dist_shape_field(shape);
+    dist_camera camera = bench_camera(&field, SIDE, SIDE);
+    dist_stats plain, with;
+    dist_images out;
+    memset(&out, 0, sizeof out);
+    memset(&plain, 0, sizeof plain);
+    memset(&with, 0, sizeof with);
+    out.depth = depth;
+    out.stats = &plain;
+    CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, NULL), ctx);
+    out.silhouette = silhouette;
+    out.stats = &with;
+    CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, NULL), ctx);
+    CHECK(with.queries > plain.queries && with.queries < plain.queries + 45000);
+    if (test_state.verbose) printf("    %s: %llu of %llu\n", model, with.queries - plain.queries, with.queries);
+    dist_shape_destroy(shape);
+    dist_net_destroy(net);
+    dist_context_destroy(ctx);
+}
+
+TEST(silhouette_of_the_embedded_model_costs_less_than_45000_queries) { check_silhouette("embedded", 5); }
+TEST(silhouette_of_bob_costs_less_than_45000_queries) { check_silhouette("bob_spot", 0); }
+TEST(silhouette_of_the_fox_costs_less_than_45000_queries) { check_silhouette("fox", 0); }
+TEST(silhouette_of_rings_costs_less_than_45000_queries) { check_silhouette("rings", 0); }
+
 TEST(memory_is_the_tracers_and_the_nets_and_a_tape_only_where_one_is_wanted)
 {
     size_t none = results[NEED_DEPTH].bytes, tape = results[NEED_DEPTH_GRADIENT].bytes;
@@ -218,6 +255,10 @@ int main(int argc, char **argv)
     RUN(twenty_points_cost_twenty_rays);
     RUN(a_static_camera_costs_about_two_queries_a_hit);
     RUN(instances_out_of_view_cost_nothing);
+    RUN(silhouette_of_the_embedded_model_costs_less_than_45000_queries);
+    RUN(silhouette_of_bob_costs_less_than_45000_queries);
+    RUN(silhouette_of_the_fox_costs_less_than_45000_queries);
+    RUN(silhouette_of_rings_costs_less_than_45000_queries);
     RUN(memory_is_the_tracers_and_the_nets_and_a_tape_only_where_one_is_wanted);
     RUN(exact_of_the_embedded_model);
     RUN(exact_of_bob_spot);

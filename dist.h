@@ -12149,8 +12149,8 @@ static void disti_silhouette_take(const disti_tracer *tracer, int worker, const 
 }
 
 /* Parabolas through three samples around the least one of the rays with width > 0: how far apart, in units of f. Both
-   sides are asked for in one call, then where the parabola is least. If that is beyond a side, f falls farther, and
-   width stays positive: twice as wide, around that side. Returns how many rays it does for. */
+   sides are asked for in one call, then where the parabola is least; fb is its value there. Beyond a side f falls
+   farther, and width stays positive: twice as wide, around that side. Returns how many rays it does for. */
 static size_t disti_silhouette_parabolas(const disti_tracer *tracer, int worker, const disti_bench *bench, int n)
 {
     size_t falling = 0;
@@ -12181,6 +12181,7 @@ static size_t disti_silhouette_parabolas(const disti_tracer *tracer, int worker,
                 continue;
             }
             float least = disti_parabola(width, left, ray->fa, right);
+            ray->fb = ray->fa - 0.25f * (left - right) * least / width;
             kept = disti_silhouette_ask(bench, index, ray->a + least, kept);
             ray->moved = DISTI_FITTED;
         }
@@ -12409,15 +12410,17 @@ static void disti_silhouette(const disti_tracer *tracer, int worker, const disti
     /* where f between nodes, of curvature 1 / f, is off by about (4 pixels)^2 / 8 f = 1e-3 radii */
     float plateau = clamp > 0.0f ? 0.98f * clamp : 3e38f;
     float far = DISTI_MIN(DISTI_MAX(0.05f, 1.5e3f * (pixel / radius) * (pixel / radius)) * radius, plateau);
-    float near = pixel > 0.01f * radius ? 0.5f * far : 0.005f * radius; /* coarse pixels have less to share */
+    /* nearer ones are fitted one by one: within two pixels of the outline, within fewer where pixels are small */
+    float near = DISTI_MAX(0.005f, DISTI_MIN(2.0f, 150.0f * pixel / radius) * pixel / radius) * radius;
     for (int i = 0; i < n; i++) bench->rays[i].width = 0.0f, bench->rays[i].moved = 0;
     disti_silhouette_nodes(tracer, worker, tile, bench, near, far, plateau);
     disti_silhouette_look(tracer, worker, tile, bench, far);
     disti_silhouette_look(tracer, worker, tile, bench, near);
-    for (int fine = 0; fine <= (pixel > 0.01f * radius); fine++) {
+    for (int fine = 0; fine <= (pixel > 0.01f * radius); fine++) { /* of coarse pixels f may be no parabola */
         for (int i = 0; i < n; i++) {
             disti_ray *ray = &bench->rays[i];
-            if (!disti_wants_minimum(ray) || ray->fbest > far || (ray->moved == DISTI_FITTED && !fine)) continue;
+            int fitted = ray->moved == DISTI_FITTED, good = fabsf(ray->fbest - ray->fb) < 0.02f * ray->fbest;
+            if (!disti_wants_minimum(ray) || ray->fbest > far || (fine ? !fitted || good : fitted)) continue;
             if (ray->fbest < near || disti_ray_beside_hit(tile, bench, i)) ray->width = fine ? 0.1f : 0.35f;
         }
         disti_silhouette_fit(tracer, worker, bench, n);

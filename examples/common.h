@@ -25,7 +25,8 @@
 #include <unistd.h>
 #endif
 
-/* stb_image_write.h is used where it can be found; without it pictures are written as PPM. */
+/* stb_image_write.h is used where it can be found; without it pictures are written as PPM. The models are taken to be
+   there by a compiler without __has_include. */
 #ifdef __has_include
 #if __has_include(<stb/stb_image_write.h>)
 #define COMMON_STB <stb/stb_image_write.h>
@@ -36,14 +37,20 @@
 #elif __has_include("../build/stb/usr/include/stb/stb_image_write.h")
 #define COMMON_STB "../build/stb/usr/include/stb/stb_image_write.h"
 #endif
-#if !defined(COMMON_NO_MODEL) && __has_include("model.h")
+#if !__has_include("model.h") && !defined(COMMON_NO_MODEL)
+#define COMMON_NO_MODEL
+#endif
+#if !__has_include("model_color.h") && defined(COMMON_TEXTURE)
+#undef COMMON_TEXTURE
+#endif
+#endif
+#ifndef COMMON_NO_MODEL
 #define COMMON_MODEL
 #include "model.h"
 #endif
-#if defined(COMMON_TEXTURE) && __has_include("model_color.h")
+#ifdef COMMON_TEXTURE
 #define COMMON_MODEL_COLOR
 #include "model_color.h"
-#endif
 #endif
 
 #ifdef COMMON_STB

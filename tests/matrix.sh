@@ -144,6 +144,11 @@ if can gcc -mfpmath=387 -fexcess-precision=fast; then # registers that hold more
 else
     skip_row x87 "gcc -mfpmath=387 does not work here"
 fi
+if can tcc; then # knows no intrinsics, no vectors and no threads: the scalar kernels
+    row tcc build/matrix/tcc tcc -O2 "" 1 "" ${quick:+test_net test_files test_camera}
+else
+    skip_row tcc "tcc is not installed"
+fi
 if have aarch64-linux-gnu-gcc && have qemu-aarch64; then
     # All of it takes an emulator too long for every change.
     row aarch64 build/matrix/aarch64 aarch64-linux-gnu-gcc "-O2 -static" "" 1 qemu-aarch64 \
@@ -158,6 +163,12 @@ if [ -z "$quick" ]; then
         row riscv64 build/matrix/riscv64 riscv64-linux-gnu-gcc "-O2 -static" "" 1 qemu-riscv64 "$@"
     else
         skip_row riscv64 "riscv64-linux-gnu-gcc and qemu-riscv64 are not both installed"
+    fi
+    if have s390x-linux-gnu-gcc && have qemu-s390x; then # the highest byte first
+        set -- test_archive test_color test_files test_kernels test_mesh test_net test_render
+        row s390x build/matrix/s390x s390x-linux-gnu-gcc "-O2 -static" "" 1 qemu-s390x "$@"
+    else
+        skip_row s390x "s390x-linux-gnu-gcc and qemu-s390x are not both installed"
     fi
     wasm="--target=wasm32-wasi --sysroot=/usr -O2 -D_WASI_EMULATED_PROCESS_CLOCKS -lwasi-emulated-process-clocks"
     if have node && can clang $wasm; then

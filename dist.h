@@ -12079,9 +12079,9 @@ static void disti_coarse_doubt(const disti_tracer *tracer, const disti_tile *til
    minimum, so it is looked for. Nodes, every 8th and then every 4th pixel, fit a parabola around their least sample or
    their block's (4 queries); then every 2nd pixel and all others get it where their nodes have it (1 query). Where f is
    so large that the nodes do, it is interpolated as well (none): what that is off by goes with the square of the nodes'
-   distance over f. Next to the outline a pixel also looks where its neighbors' minima are, and fits a parabola; other
-   pixels near hits, for which nodes cannot speak, ask where their neighbors nearer to the outline say (1 query). A value
-   off by ds costs ds^2 / 2 times the curvature: first-order exact (envelope theorem). */
+   distance over f. Next to the outline a pixel also looks where its neighbors' minima are, and fits a parabola; others
+   near hits, for which no nodes speak, ask where their neighbors nearer to the outline say (1 query). A value off by ds
+   costs ds^2 / 2 times the curvature: first-order exact (envelope theorem). */
 enum {
     DISTI_FITTED = 1, /* its parabola has been made */
     DISTI_UNSURE,     /* beside hits: its nodes do not foretell its f; waits for neighbors nearer to the outline */

@@ -72,9 +72,7 @@ csv() {
     ! grep -q -x "ended with an error: $name" "build/$name.txt"
     status=$?
     if [ $status = 0 ]; then
-        mv "build/$name.csv" "$folder/$name.csv"
-        rm -f "$folder/$name.txt"
-        if [ -s "build/$name.txt" ]; then mv "build/$name.txt" "$folder/$name.txt"; fi
+        mv "build/$name.csv" "$folder/$name.csv" && mv "build/$name.txt" "$folder/$name.txt"
     else
         tail -n 3 "build/$name.txt"
     fi

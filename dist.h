@@ -12106,13 +12106,23 @@ static void disti_keep_least(disti_ray *ray, float s, float f)
     ray->fbest = f;
 }
 
-/* Evaluates `count` points of bench->points for the silhouette, or as many as the budget has room for. */
-static size_t disti_silhouette_eval(const disti_tracer *tracer, int worker, const disti_bench *bench, size_t count)
-{
-    count = disti_query(tracer, worker, bench, count);
-    bench->stats->silhouette_queries += count;
-    return count;
-}
+/* What is known of a tile's rays while their least |f| is looked for. */
+typedef struct disti_minima {
+    const disti_tracer *tracer;
+    const disti_tile *tile;
+    const disti_bench *bench;
+    int worker;
+    float radius, pixel;
+    float near, far; /* rays with f below near are fitted one by one; from far on those of every 4th pixel do for all */
+    float plateau;   /* from this f on the field may be clamped, and f between nodes is all the same */
+    int *cells[2];   /* first pixels of blocks between nodes, of this round and of the next */
+    int *close;      /* rays with f of at most far */
+    int *fits;       /* rays that are to be fitted: width > 0 */
+    size_t close_count, fit_count;
+} disti_minima;
+
+enum { DISTI_NODE = 4 }; /* pixels between nodes; the tile's last row and column have some, too */
+enum { DISTI_NODE_CELLS = (DISTI_TILE / 2 + 1) * (DISTI_TILE / 2 + 1) };
 
 /* s of the least of the parabola through (-h, left), (0, middle), (h, right), within (-h, h). */
 static float disti_parabola(float h, float left, float middle, float right)
@@ -12129,229 +12139,325 @@ static float disti_ray_within(const disti_ray *ray, float s)
     return DISTI_MIN(DISTI_MAX(s, ray->enter), ray->leave);
 }
 
-/* Asks for f at s of ray `index`. */
-static size_t disti_silhouette_ask(const disti_bench *bench, int index, float s, size_t count)
-{
-    disti_ray *ray = &bench->rays[index];
-    ray->q = disti_ray_within(ray, s);
-    disti_ray_point(ray, ray->q, bench->points + 3 * count);
-    bench->index[count] = index;
-    return count + 1;
-}
-
-/* What the `count` samples asked for say; where the budget ends, none. */
-static void disti_silhouette_take(const disti_tracer *tracer, int worker, const disti_bench *bench, size_t count)
-{
-    count = disti_silhouette_eval(tracer, worker, bench, count);
-    for (size_t k = 0; k < count; k++) {
-        disti_ray *ray = &bench->rays[bench->index[k]];
-        disti_keep_least(ray, ray->q, bench->sdf[k]);
-    }
-}
-
-/* Parabolas through three samples around the least one of the rays with width > 0: how far apart, in units of f. Both
-   sides are asked for in one call, then where the parabola is least; fb is its value there. Beyond a side f falls
-   farther, and width stays positive: twice as wide, around that side. Returns how many rays it does for. */
-static size_t disti_silhouette_parabolas(const disti_tracer *tracer, int worker, const disti_bench *bench, int n)
-{
-    size_t falling = 0;
-    for (int i = 0; i < n;) { /* as many rays as there is room for */
-        size_t count = 0;
-        for (; i < n && count + 2 <= (size_t)DISTI_TILE_RAYS; i++) {
-            disti_ray *ray = &bench->rays[i];
-            if (!(ray->width > 0.0f)) continue;
-            ray->width = DISTI_MAX(ray->width * ray->fbest, 2e-3f * tracer->field->radius);
-            ray->a = ray->best; /* the least sample as it stood */
-            ray->fa = ray->fbest;
-            count = disti_silhouette_ask(bench, i, ray->a - ray->width, count);
-            count = disti_silhouette_ask(bench, i, ray->a + ray->width, count);
-        }
-        size_t asked = disti_silhouette_eval(tracer, worker, bench, count), kept = 0;
-        for (size_t k = 0; k < count; k += 2) {
-            int index = bench->index[k];
-            disti_ray *ray = &bench->rays[index];
-            float width = ray->width;
-            ray->width = 0.0f;
-            if (k < asked) disti_keep_least(ray, disti_ray_within(ray, ray->a - width), bench->sdf[k]);
-            if (k + 1 >= asked) continue;
-            disti_keep_least(ray, disti_ray_within(ray, ray->a + width), bench->sdf[k + 1]);
-            float left = bench->sdf[k], right = bench->sdf[k + 1], fall = left < right ? right - left : left - right;
-            if (ray->best != ray->a && !(left - 2.0f * ray->fa + right > 0.5f * fall)) {
-                ray->width = 2.0f * width / DISTI_MAX(ray->fbest, 1e-30f);
-                falling++;
-                continue;
-            }
-            float least = disti_parabola(width, left, ray->fa, right);
-            ray->fb = ray->fa - 0.25f * (left - right) * least / width;
-            kept = disti_silhouette_ask(bench, index, ray->a + least, kept);
-            ray->moved = DISTI_FITTED;
-        }
-        disti_silhouette_take(tracer, worker, bench, kept);
-    }
-    return falling;
-}
-
-static void disti_silhouette_fit(const disti_tracer *tracer, int worker, const disti_bench *bench, int n)
-{
-    for (int k = 0; k < 5 && disti_silhouette_parabolas(tracer, worker, bench, n) > 0; k++) continue;
-    for (int i = 0; i < n; i++) bench->rays[i].width = 0.0f;
-}
-
-enum { DISTI_NODE = 4 }; /* pixels between nodes; the tile's last row and column have some, too */
-
 static float disti_ray_distance(const disti_ray *ray)
 {
     return (float)(ray->base + (double)ray->best);
 }
 
-/* The minimum of the ray at (x, y) interpolated from the nodes around it, h pixels apart: distance from the camera, and
-   f. Nodes whose own minimum is elsewhere on the ray (of another part of the shape) than the least one's are left out.
-   Returns how many of the four agree. */
-static int disti_silhouette_between(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench, int x,
-                                    int y, int h, float *t, float *f)
+/* Lists f at s of ray `index` to be asked for. */
+static size_t disti_minima_list(const disti_minima *m, int index, float s, size_t count)
 {
-    int x0 = x / h * h, x1 = DISTI_MIN(x0 + h, tile->width - 1);
-    int y0 = y / h * h, y1 = DISTI_MIN(y0 + h, tile->height - 1);
-    float u = (float)(x - x0) / (float)DISTI_MAX(x1 - x0, 1), v = (float)(y - y0) / (float)DISTI_MAX(y1 - y0, 1);
-    const disti_ray *corner[4], *least = NULL;
-    float weight[4], sum = 0.0f;
-    int agree = 0;
-    for (int k = 0; k < 4; k++) {
-        corner[k] = &bench->rays[(k & 2 ? y1 : y0) * tile->width + (k & 1 ? x1 : x0)];
-        weight[k] = (k & 1 ? u : 1.0f - u) * (k & 2 ? v : 1.0f - v) + 1e-3f;
-        if (!disti_has_minimum(corner[k])) corner[k] = NULL;
-        else if (!least || corner[k]->fbest < least->fbest) least = corner[k];
+    disti_ray *ray = &m->bench->rays[index];
+    ray->q = disti_ray_within(ray, s);
+    disti_ray_point(ray, ray->q, m->bench->points + 3 * count);
+    m->bench->index[count] = index;
+    return count + 1;
+}
+
+/* The same where the distance from the camera is t. */
+static size_t disti_minima_list_at(const disti_minima *m, int index, float t, size_t count)
+{
+    return disti_minima_list(m, index, (float)((double)t - m->bench->rays[index].base), count);
+}
+
+/* Evaluates the `count` samples that are listed, or as many as the budget has room for. */
+static size_t disti_minima_eval(const disti_minima *m, size_t count)
+{
+    count = disti_query(m->tracer, m->worker, m->bench, count);
+    m->bench->stats->silhouette_queries += count;
+    return count;
+}
+
+/* And keeps what they say. */
+static void disti_minima_ask(const disti_minima *m, size_t count)
+{
+    count = disti_minima_eval(m, count);
+    for (size_t k = 0; k < count; k++) {
+        disti_ray *ray = &m->bench->rays[m->bench->index[k]];
+        disti_keep_least(ray, ray->q, m->bench->sdf[k]);
     }
-    *t = *f = 0.0f;
-    for (int k = 0; k < 4; k++) {
-        if (!corner[k]) continue;
-        float at = disti_ray_distance(corner[k]), off = at - disti_ray_distance(least);
-        if ((off < 0.0f ? -off : off) > 0.1f * tracer->field->radius) continue;
-        *t += weight[k] * at;
-        *f += weight[k] * corner[k]->fbest;
-        sum += weight[k];
-        agree++;
+}
+
+static void disti_minima_want_fit(disti_minima *m, int index, float width)
+{
+    m->bench->rays[index].width = width;
+    m->fits[m->fit_count++] = index;
+}
+
+/* Parabolas through three samples around the least one of the rays in `fits`; width: how far apart, in units of f. Both
+   sides are asked for in one call, then where the parabola is least; fb is its value there. Beyond a side f falls
+   farther, and the ray stays in the list: twice as wide, around that side. */
+static void disti_minima_parabolas(disti_minima *m)
+{
+    const disti_bench *bench = m->bench;
+    size_t falling = 0;
+    for (size_t i = 0; i < m->fit_count;) { /* as many rays as there is room for */
+        size_t count = 0;
+        for (; i < m->fit_count && count + 2 <= (size_t)DISTI_TILE_RAYS; i++) {
+            disti_ray *ray = &bench->rays[m->fits[i]];
+            ray->width = DISTI_MAX(ray->width * ray->fbest, 2e-3f * m->radius);
+            ray->a = ray->best; /* the least sample as it stood */
+            ray->fa = ray->fbest;
+            count = disti_minima_list(m, m->fits[i], ray->a - ray->width, count);
+            count = disti_minima_list(m, m->fits[i], ray->a + ray->width, count);
+        }
+        size_t asked = disti_minima_eval(m, count), kept = 0;
+        for (size_t k = 0; k + 1 < asked; k += 2) {
+            int index = bench->index[k];
+            disti_ray *ray = &bench->rays[index];
+            float width = ray->width, left = bench->sdf[k], right = bench->sdf[k + 1];
+            disti_keep_least(ray, disti_ray_within(ray, ray->a - width), left);
+            disti_keep_least(ray, disti_ray_within(ray, ray->a + width), right);
+            float fall = left < right ? right - left : left - right;
+            if (ray->best != ray->a && !(left - 2.0f * ray->fa + right > 0.5f * fall)) {
+                ray->width = 2.0f * width / DISTI_MAX(ray->fbest, 1e-30f);
+                m->fits[falling++] = index;
+                continue;
+            }
+            float least = disti_parabola(width, left, ray->fa, right);
+            ray->fb = ray->fa - 0.25f * (left - right) * least / width;
+            kept = disti_minima_list(m, index, ray->a + least, kept);
+            ray->moved = DISTI_FITTED;
+        }
+        disti_minima_ask(m, kept);
     }
-    if (agree) *t /= sum;
-    if (agree) *f /= sum;
-    return agree;
+    m->fit_count = falling;
+}
+
+static void disti_minima_fit(disti_minima *m)
+{
+    for (int k = 0; k < 5 && m->fit_count > 0; k++) disti_minima_parabolas(m);
+    m->fit_count = 0;
 }
 
 /* h: a power of two */
-static int disti_silhouette_node(const disti_tile *tile, int x, int y, int h)
+static int disti_is_node(const disti_tile *tile, int x, int y, int h)
 {
     return (!(x & (h - 1)) || x == tile->width - 1) && (!(y & (h - 1)) || y == tile->height - 1);
 }
 
-/* A node of distance h: from f = enough on it takes what the four twice as far apart say, else it asks there. */
-static size_t disti_silhouette_place(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench,
-                                     int x, int y, int h, float enough, size_t count)
+/* The next node's column or row after that at `at`, of nodes h apart below `end`. */
+static int disti_node_after(int at, int h, int end)
 {
-    int index = y * tile->width + x, agree = 0;
-    int block = y / DISTI_LEAST_BLOCK * DISTI_LEAST_ROW + x / DISTI_LEAST_BLOCK;
-    float t = bench->least_of->t[block], f = bench->least_of->f[block];
-    disti_ray *ray = &bench->rays[index];
-    if (h < 2 * DISTI_NODE) {
-        if (disti_silhouette_node(tile, x, y, 2 * h)) return count;
-        float between = 0.0f, value = 0.0f;
-        agree = disti_silhouette_between(tracer, tile, bench, x, y, 2 * h, &between, &value);
-        if (agree) t = between;
-        if (agree) f = value;
+    return at == end - 1 ? end : DISTI_MIN((at / h + 1) * h, end - 1);
+}
+
+/* Four nodes and what they say about the pixels between. A node whose own minimum is elsewhere on the ray (of another
+   part of the shape) than the least one's is left out. */
+typedef struct disti_corners {
+    int x0, y0;
+    float x_scale, y_scale;
+    float t[4], f[4], weight[4]; /* distance from the camera, f; weight 0: left out */
+    float lowest;                /* f */
+    int agree;                   /* how many there are */
+} disti_corners;
+
+static void disti_minima_corners(const disti_minima *m, int x0, int y0, int h, disti_corners *corners)
+{
+    int w = m->tile->width, x1 = DISTI_MIN(x0 + h, w - 1), y1 = DISTI_MIN(y0 + h, m->tile->height - 1), least = -1;
+    corners->x0 = x0;
+    corners->y0 = y0;
+    corners->x_scale = 1.0f / (float)DISTI_MAX(x1 - x0, 1);
+    corners->y_scale = 1.0f / (float)DISTI_MAX(y1 - y0, 1);
+    corners->agree = 0;
+    for (int k = 0; k < 4; k++) {
+        const disti_ray *ray = &m->bench->rays[(k & 2 ? y1 : y0) * w + (k & 1 ? x1 : x0)];
+        corners->weight[k] = disti_has_minimum(ray) ? 1.0f : 0.0f;
+        corners->t[k] = disti_ray_distance(ray);
+        corners->f[k] = ray->fbest;
+        if (corners->weight[k] > 0.0f && (least < 0 || ray->fbest < corners->f[least])) least = k;
     }
-    ray->fb = agree == 4 ? f : 0.0f; /* what is to be expected; beside hits nothing is */
+    if (least < 0) return;
+    corners->lowest = corners->f[least];
+    for (int k = 0; k < 4; k++) {
+        float off = corners->t[k] - corners->t[least];
+        if (!((off < 0.0f ? -off : off) <= 0.1f * m->radius)) corners->weight[k] = 0.0f;
+        corners->agree += corners->weight[k] > 0.0f;
+    }
+}
+
+/* Interpolated at (x, y), where one agrees at least. */
+static void disti_corners_at(const disti_corners *corners, int x, int y, float *t, float *f)
+{
+    float u = (float)(x - corners->x0) * corners->x_scale, v = (float)(y - corners->y0) * corners->y_scale, sum = 0.0f;
+    *t = *f = 0.0f;
+    for (int k = 0; k < 4; k++) {
+        if (!(corners->weight[k] > 0.0f)) continue;
+        float weight = (k & 1 ? u : 1.0f - u) * (k & 2 ? v : 1.0f - v) + 1e-3f;
+        *t += weight * corners->t[k];
+        *f += weight * corners->f[k];
+        sum += weight;
+    }
+    *t /= sum;
+    *f /= sum;
+}
+
+/* Gives all rays of a block of h by h pixels the minimum that its corners say. */
+static void disti_minima_fill(const disti_minima *m, const disti_corners *corners, int h)
+{
+    int x1 = DISTI_MIN(corners->x0 + h, m->tile->width), y1 = DISTI_MIN(corners->y0 + h, m->tile->height);
+    const float *t = corners->t, *f = corners->f;
+    for (int y = corners->y0; y < y1; y++) {
+        float v = (float)(y - corners->y0) * corners->y_scale;
+        float t0 = t[0] + v * (t[2] - t[0]), f0 = f[0] + v * (f[2] - f[0]);
+        float t1 = corners->x_scale * (t[1] + v * (t[3] - t[1]) - t0);
+        float f1 = corners->x_scale * (f[1] + v * (f[3] - f[1]) - f0);
+        disti_ray *ray = &m->bench->rays[y * m->tile->width + corners->x0];
+        for (int x = 0; x < x1 - corners->x0; x++, ray++)
+            if (disti_wants_minimum(ray))
+                disti_keep_least(ray, (float)((double)(t0 + t1 * (float)x) - ray->base), f0 + f1 * (float)x);
+    }
+}
+
+/* A node amid four others: from f = enough on it takes what they say, else it asks there. */
+static size_t disti_minima_place(disti_minima *m, const disti_corners *corners, int x, int y, int h, float enough,
+                                 size_t count)
+{
+    int index = y * m->tile->width + x, block = y / DISTI_LEAST_BLOCK * DISTI_LEAST_ROW + x / DISTI_LEAST_BLOCK;
+    disti_ray *ray = &m->bench->rays[index];
+    float t = m->bench->least_of->t[block], f = m->bench->least_of->f[block];
+    if (corners->agree > 0) disti_corners_at(corners, x, y, &t, &f);
+    ray->fb = corners->agree == 4 ? f : 0.0f; /* what is to be expected; beside hits nothing is */
     float s = f < 2e38f ? (float)((double)t - ray->base) : 0.0f;
-    if (agree == 4 && f > enough) {
+    if (corners->agree == 4 && f > enough) {
         disti_keep_least(ray, s, f);
         return count;
     }
-    if (agree || h == 2 * DISTI_NODE || ray->fbest > 2e38f) count = disti_silhouette_ask(bench, index, s, count);
-    if (h >= DISTI_NODE) ray->width = h == DISTI_NODE ? 0.35f : 0.7f;
+    if (corners->agree > 0 || ray->fbest > 2e38f) count = disti_minima_list(m, index, s, count);
+    if (h == DISTI_NODE) disti_minima_want_fit(m, index, 0.35f);
     return count;
 }
 
-/* The neighbor of ray `index`, k = 0 to 3: right, left, below, above; NULL beyond the tile. */
-static const disti_ray *disti_ray_beside(const disti_tile *tile, const disti_bench *bench, int index, int k)
+/* Nodes 8 pixels apart: where their blocks of cones or they themselves had the least sample. */
+static void disti_minima_first(disti_minima *m)
 {
-    int x = index % tile->width + (k == 0) - (k == 1), y = index / tile->width + (k == 2) - (k == 3);
-    int beyond = x < 0 || y < 0 || x >= tile->width || y >= tile->height;
-    return beyond ? NULL : &bench->rays[y * tile->width + x];
-}
-
-static int disti_ray_beside_hit(const disti_tile *tile, const disti_bench *bench, int index)
-{
-    for (int k = 0; k < 4; k++) {
-        const disti_ray *other = disti_ray_beside(tile, bench, index, k);
-        if (other && other->status == DIST_RAY_HIT) return 1;
-    }
-    return 0;
-}
-
-/* Nodes, and what they say of the rays between them. From f = far on the rays of every 4th pixel do for all others. */
-static void disti_silhouette_nodes(const disti_tracer *tracer, int worker, const disti_tile *tile,
-                                   const disti_bench *bench, float near, float far, float plateau)
-{
-    int n = tile->width * tile->height, w = tile->width;
-    float radius = tracer->field->radius;
-    for (int h = 2 * DISTI_NODE; h >= 1; h /= 2) {
-        /* from this f on nodes 2 h apart do for what lies between them; that of a plateau is all the same */
-        float apart = 2.0f * (float)h / (float)DISTI_NODE, enough = DISTI_MIN(apart * apart * far, plateau);
+    const int h = 2 * DISTI_NODE, w = m->tile->width;
+    for (int again = 0; again < 2; again++) {
         size_t count = 0;
-        for (int y = 0; y < tile->height; y++)
-            for (int x = 0; x < w; x++)
-                if (disti_silhouette_node(tile, x, y, h) && disti_wants_minimum(&bench->rays[y * w + x]))
-                    count = disti_silhouette_place(tracer, tile, bench, x, y, h, enough, count);
-        disti_silhouette_take(tracer, worker, bench, count);
+        for (int y = 0; y < m->tile->height; y = disti_node_after(y, h, m->tile->height)) {
+            for (int x = 0; x < w; x = disti_node_after(x, h, w)) {
+                int block = y / DISTI_LEAST_BLOCK * DISTI_LEAST_ROW + x / DISTI_LEAST_BLOCK;
+                disti_ray *ray = &m->bench->rays[y * w + x];
+                float t = m->bench->least_of->t[block], f = m->bench->least_of->f[block];
+                if (!disti_wants_minimum(ray)) continue;
+                if (!again) {
+                    count = disti_minima_list(m, y * w + x, f < 2e38f ? (float)((double)t - ray->base) : 0.0f, count);
+                    disti_minima_want_fit(m, y * w + x, 0.7f);
+                    continue;
+                }
+                /* the cones' samples are far apart: where the first fit helped, once more */
+                if (ray->moved == DISTI_FITTED && ray->best == ray->a) continue;
+                if (ray->fbest < DISTI_MIN(4.0f * m->far, m->plateau)) disti_minima_want_fit(m, y * w + x, 0.35f);
+            }
+        }
+        disti_minima_ask(m, count);
+        disti_minima_fit(m);
+    }
+}
+
+/* Nodes of half and half that distance, down to all pixels, in blocks that nodes stand around: where those say it all,
+   it is filled with that, else it falls into four. */
+static void disti_minima_nodes(disti_minima *m)
+{
+    const disti_bench *bench = m->bench;
+    int w = m->tile->width, height = m->tile->height;
+    size_t cell_count = 0;
+    disti_minima_first(m);
+    for (int y = 0; y < height; y += 2 * DISTI_NODE)
+        for (int x = 0; x < w; x += 2 * DISTI_NODE) m->cells[0][cell_count++] = y * w + x;
+    for (int h = DISTI_NODE, round = 0; h >= 1; h /= 2, round ^= 1) {
+        const int *cells = m->cells[round];
+        int *next = m->cells[round ^ 1];
+        /* from this f on nodes 2 h apart do for what lies between them; that of a plateau is all the same */
+        float apart = 2.0f * (float)h / (float)DISTI_NODE, enough = DISTI_MIN(apart * apart * m->far, m->plateau);
+        size_t count = 0, next_count = 0;
+        for (size_t i = 0; i < cell_count; i++) {
+            disti_corners corners;
+            int x0 = cells[i] % w, y0 = cells[i] / w, x1 = DISTI_MIN(x0 + 2 * h, w), y1 = DISTI_MIN(y0 + 2 * h, height);
+            disti_minima_corners(m, x0, y0, 2 * h, &corners);
+            if (corners.agree == 4 && corners.lowest > enough) {
+                disti_minima_fill(m, &corners, 2 * h);
+                continue;
+            }
+            for (int y = y0; y < y1; y = disti_node_after(y, h, height))
+                for (int x = x0; x < x1; x = disti_node_after(x, h, w))
+                    if (!disti_is_node(m->tile, x, y, 2 * h) && disti_wants_minimum(&bench->rays[y * w + x]))
+                        count = disti_minima_place(m, &corners, x, y, h, enough, count);
+            for (int y = y0; y < y1 && h > 1; y += h)
+                for (int x = x0; x < x1; x += h) next[next_count++] = y * w + x;
+        }
+        disti_minima_ask(m, count);
         for (size_t k = 0; k < count && h < DISTI_NODE; k++) { /* f larger than foretold: the least is elsewhere */
             disti_ray *ray = &bench->rays[bench->index[k]];
-            if (!(ray->fbest > near && ray->fbest < far)) continue; /* nearer ones are fitted in any case */
+            if (!(ray->fbest > m->near && ray->fbest < m->far)) continue; /* nearer ones are fitted in any case */
             if (!(ray->fb > 0.0f)) ray->moved = DISTI_UNSURE;
-            else if (ray->fbest > 1.2f * ray->fb + 5e-4f * radius) ray->width = 0.35f;
+            else if (ray->fbest > 1.2f * ray->fb + 5e-4f * m->radius) disti_minima_want_fit(m, bench->index[k], 0.35f);
         }
-        for (int i = 0; i < n; i++)
-            if (h == DISTI_NODE && bench->rays[i].fbest > far) bench->rays[i].width = 0.0f;
-        disti_silhouette_fit(tracer, worker, bench, n);
-        if (h <= DISTI_NODE) continue;
-        for (int i = 0; i < n; i++) { /* the cones' samples are far apart: where that helped, once more */
-            disti_ray *ray = &bench->rays[i];
-            if (!disti_silhouette_node(tile, i % w, i / w, h) || !disti_wants_minimum(ray)) continue;
-            if (ray->moved == DISTI_FITTED && ray->best == ray->a) continue;
-            if (ray->fbest < DISTI_MIN(4.0f * far, plateau)) ray->width = 0.35f;
-        }
-        disti_silhouette_fit(tracer, worker, bench, n);
+        size_t fits = m->fit_count;
+        m->fit_count = 0;
+        for (size_t k = 0; k < fits; k++)
+            if (!(bench->rays[m->fits[k]].fbest > m->far)) m->fits[m->fit_count++] = m->fits[k];
+        disti_minima_fit(m);
+        cell_count = next_count;
     }
+}
+
+/* The neighbors of ray `index`: right, left, below, above; NULL beyond the tile. */
+static void disti_rays_beside(const disti_minima *m, int index, const disti_ray *other[4])
+{
+    int w = m->tile->width, x = index % w, y = index / w;
+    const disti_ray *ray = &m->bench->rays[index];
+    other[0] = x + 1 < w ? ray + 1 : NULL;
+    other[1] = x > 0 ? ray - 1 : NULL;
+    other[2] = y + 1 < m->tile->height ? ray + w : NULL;
+    other[3] = y > 0 ? ray - w : NULL;
 }
 
 /* Rays also look where their neighbors' least samples are. */
-static void disti_silhouette_look(const disti_tracer *tracer, int worker, const disti_tile *tile,
-                                  const disti_bench *bench, float limit)
+static void disti_minima_look(const disti_minima *m, float limit)
 {
-    int n = tile->width * tile->height;
-    float radius = tracer->field->radius;
     size_t count = 0;
-    for (int i = 0; i < n; i++) {
-        disti_ray *ray = &bench->rays[i];
-        const disti_ray *best = ray;
-        if (!disti_wants_minimum(ray) || ray->fbest > limit) continue;
-        for (int k = 0; k < 4; k++) {
-            const disti_ray *other = disti_ray_beside(tile, bench, i, k);
-            if (other && disti_has_minimum(other) && other->fbest < best->fbest) best = other;
-        }
+    for (size_t i = 0; i < m->close_count; i++) {
+        disti_ray *ray = &m->bench->rays[m->close[i]];
+        const disti_ray *best = ray, *other[4];
+        if (ray->fbest > limit) continue;
+        disti_rays_beside(m, m->close[i], other);
+        for (int k = 0; k < 4; k++)
+            if (other[k] && disti_has_minimum(other[k]) && other[k]->fbest < best->fbest) best = other[k];
         float away = disti_ray_distance(best) - disti_ray_distance(ray);
-        if (!(away * away > 4e-4f * radius * radius)) continue;
+        if (!(away * away > 4e-4f * m->radius * m->radius)) continue;
         if (ray->moved == DISTI_FITTED) ray->moved = 0;
-        count = disti_silhouette_ask(bench, i, (float)((double)disti_ray_distance(best) - ray->base), count);
+        count = disti_minima_list_at(m, m->close[i], disti_ray_distance(best), count);
     }
-    disti_silhouette_take(tracer, worker, bench, count);
+    disti_minima_ask(m, count);
+}
+
+/* Fits the rays nearest to the outline and those beside hits. Of coarse pixels f may be no parabola: once more, in a
+   narrower one, where it was not what the first said. */
+static void disti_minima_outline(disti_minima *m)
+{
+    for (int fine = 0; fine <= (m->pixel > 0.01f * m->radius); fine++) {
+        for (size_t i = 0; i < m->close_count; i++) {
+            const disti_ray *ray = &m->bench->rays[m->close[i]], *other[4];
+            int fitted = ray->moved == DISTI_FITTED, good = fabsf(ray->fbest - ray->fb) < 0.02f * ray->fbest;
+            int wanted = ray->fbest < m->near;
+            if (fine ? !fitted || good : fitted) continue;
+            if (!wanted) disti_rays_beside(m, m->close[i], other);
+            for (int k = 0; k < 4 && !wanted; k++) wanted = other[k] && other[k]->status == DIST_RAY_HIT;
+            if (wanted) disti_minima_want_fit(m, m->close[i], fine ? 0.1f : 0.35f);
+        }
+        disti_minima_fit(m);
+    }
 }
 
 /* What the neighbors nearer to the outline, one or two, say of an unsure ray: with the pixel between them they span a
    plane, at a straight edge of the shape the truth. Returns 0 if there is none. */
-static int disti_silhouette_foretell(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench,
-                                     int index, float *t, float *f)
+static int disti_minima_foretell(const disti_minima *m, int index, float *t, float *f)
 {
-    const disti_ray *ray = &bench->rays[index], *inner[2] = {NULL, NULL};
+    const disti_ray *ray = &m->bench->rays[index], *inner[2] = {NULL, NULL}, *others[4];
+    disti_rays_beside(m, index, others);
     for (int k = 0; k < 4; k++) {
-        const disti_ray *other = disti_ray_beside(tile, bench, index, k), *known = inner[k / 2];
+        const disti_ray *other = others[k], *known = inner[k / 2];
         if (!other || !disti_has_minimum(other) || other->moved >= DISTI_UNSURE || other->fbest > ray->fbest) continue;
         if (!known || other->fbest < known->fbest) inner[k / 2] = other;
     }
@@ -12362,7 +12468,7 @@ static int disti_silhouette_foretell(const disti_tracer *tracer, const disti_til
     if (!inner[0] || !inner[1]) return 1;
     const disti_ray *between = inner[0] + (inner[1] - ray);
     if (!disti_has_minimum(between) || between->moved >= DISTI_UNSURE) return 1;
-    float far = 0.1f * tracer->field->radius, base = disti_ray_distance(between);
+    float far = 0.1f * m->radius, base = disti_ray_distance(between);
     float u = disti_ray_distance(inner[0]) - base, v = disti_ray_distance(inner[1]) - base;
     if (DISTI_MAX(u * u, v * v) > far * far) return 1; /* of another part of the shape */
     *t = base + u + v;
@@ -12372,61 +12478,68 @@ static int disti_silhouette_foretell(const disti_tracer *tracer, const disti_til
 
 /* The unsure rays, from the outline outward: asked for where the neighbors say (1 query), fitted where f is larger than
    they say. Those that no neighbor tells anything of are fitted. */
-static void disti_silhouette_sweep(const disti_tracer *tracer, int worker, const disti_tile *tile,
-                                   const disti_bench *bench)
+static void disti_minima_sweep(disti_minima *m)
 {
-    int n = tile->width * tile->height, unsure = 1;
-    while (unsure) {
-        size_t count = 0;
-        int told = 0;
-        unsure = 0;
-        for (int i = 0; i < n; i++) {
-            disti_ray *ray = &bench->rays[i];
+    for (;;) {
+        size_t count = 0, unsure = 0, told = 0;
+        for (size_t i = 0; i < m->close_count; i++) { /* of those that are close only the unsure ones still matter */
+            int index = m->close[i];
+            disti_ray *ray = &m->bench->rays[index];
             float t = 0.0f;
             if (ray->moved != DISTI_UNSURE) continue;
-            unsure++;
-            if (!disti_silhouette_foretell(tracer, tile, bench, i, &t, &ray->fb)) continue;
+            m->close[unsure++] = index;
+            if (!disti_minima_foretell(m, index, &t, &ray->fb)) continue;
             told++;
             ray->moved = DISTI_FORETOLD;
-            float away = t - disti_ray_distance(ray), near = 0.1f * ray->fbest, s = (float)((double)t - ray->base);
-            if (away * away > near * near) count = disti_silhouette_ask(bench, i, s, count);
+            float away = t - disti_ray_distance(ray), near = 0.1f * ray->fbest;
+            if (away * away > near * near) count = disti_minima_list_at(m, index, t, count);
         }
-        disti_silhouette_take(tracer, worker, bench, count);
-        for (int i = 0; i < n && unsure; i++) {
-            disti_ray *ray = &bench->rays[i];
-            int wrong = ray->fbest > 1.1f * ray->fb + 5e-4f * tracer->field->radius;
-            if (ray->moved < DISTI_UNSURE || (told && ray->moved == DISTI_UNSURE)) continue;
-            if (wrong || ray->moved == DISTI_UNSURE) ray->width = 0.35f;
+        if (unsure == 0) return;
+        m->close_count = unsure;
+        disti_minima_ask(m, count);
+        for (size_t i = 0; i < unsure; i++) {
+            disti_ray *ray = &m->bench->rays[m->close[i]];
+            int wrong = ray->fbest > 1.1f * ray->fb + 5e-4f * m->radius;
+            if (told && ray->moved == DISTI_UNSURE) continue;
+            if (wrong || ray->moved == DISTI_UNSURE) disti_minima_want_fit(m, m->close[i], 0.35f);
             ray->moved = 0;
         }
-        disti_silhouette_fit(tracer, worker, bench, n);
+        disti_minima_fit(m);
     }
 }
 
 static void disti_silhouette(const disti_tracer *tracer, int worker, const disti_tile *tile, const disti_bench *bench)
 {
+    disti_minima minima, *m = &minima;
+    size_t at = 0;
     int n = tile->width * tile->height;
-    float radius = tracer->field->radius, clamp = tracer->field->clamp;
-    float pixel = disti_pixel_width(tracer, tile);
+    float radius = tracer->field->radius, clamp = tracer->field->clamp, pixel = disti_pixel_width(tracer, tile);
+    memset(m, 0, sizeof *m);
+    m->tracer = tracer;
+    m->tile = tile;
+    m->bench = bench;
+    m->worker = worker;
+    m->radius = radius;
+    m->pixel = pixel;
     /* where f between nodes, of curvature 1 / f, is off by about (4 pixels)^2 / 8 f = 1e-3 radii */
-    float plateau = clamp > 0.0f ? 0.98f * clamp : 3e38f;
-    float far = DISTI_MIN(DISTI_MAX(0.05f, 1.5e3f * (pixel / radius) * (pixel / radius)) * radius, plateau);
-    /* nearer ones are fitted one by one: within two pixels of the outline, within fewer where pixels are small */
-    float near = DISTI_MAX(0.005f, DISTI_MIN(2.0f, 150.0f * pixel / radius) * pixel / radius) * radius;
-    for (int i = 0; i < n; i++) bench->rays[i].width = 0.0f, bench->rays[i].moved = 0;
-    disti_silhouette_nodes(tracer, worker, tile, bench, near, far, plateau);
-    disti_silhouette_look(tracer, worker, tile, bench, far);
-    disti_silhouette_look(tracer, worker, tile, bench, near);
-    for (int fine = 0; fine <= (pixel > 0.01f * radius); fine++) { /* of coarse pixels f may be no parabola */
-        for (int i = 0; i < n; i++) {
-            disti_ray *ray = &bench->rays[i];
-            int fitted = ray->moved == DISTI_FITTED, good = fabsf(ray->fbest - ray->fb) < 0.02f * ray->fbest;
-            if (!disti_wants_minimum(ray) || ray->fbest > far || (fine ? !fitted || good : fitted)) continue;
-            if (ray->fbest < near || disti_ray_beside_hit(tile, bench, i)) ray->width = fine ? 0.1f : 0.35f;
-        }
-        disti_silhouette_fit(tracer, worker, bench, n);
-    }
-    disti_silhouette_sweep(tracer, worker, tile, bench);
+    m->plateau = clamp > 0.0f ? 0.98f * clamp : 3e38f;
+    m->far = DISTI_MIN(DISTI_MAX(0.05f, 1.5e3f * (pixel / radius) * (pixel / radius)) * radius, m->plateau);
+    /* within two pixels of the outline, within fewer where pixels are small */
+    m->near = DISTI_MAX(0.005f, DISTI_MIN(2.0f, 150.0f * pixel / radius) * pixel / radius) * radius;
+    m->cells[0] = (int *)disti_take(bench->rest, &at, DISTI_NODE_CELLS, sizeof(int));
+    m->cells[1] = (int *)disti_take(bench->rest, &at, DISTI_NODE_CELLS, sizeof(int));
+    m->close = (int *)disti_take(bench->rest, &at, DISTI_TILE_RAYS, sizeof(int));
+    m->fits = (int *)disti_take(bench->rest, &at, DISTI_TILE_RAYS, sizeof(int));
+    DIST_ASSERT(at <= (size_t)DISTI_REST_BYTES);
+    for (int i = 0; i < n; i++) bench->rays[i].moved = 0;
+    disti_minima_nodes(m);
+    for (int i = 0; i < n; i++)
+        if (disti_wants_minimum(&bench->rays[i]) && !(bench->rays[i].fbest > m->far)) m->close[m->close_count++] = i;
+    if (m->close_count == 0) return;
+    disti_minima_look(m, m->far);
+    disti_minima_look(m, m->near);
+    disti_minima_outline(m);
+    disti_minima_sweep(m);
 }
 
 #ifndef DIST_NO_PAPER
@@ -13562,7 +13675,7 @@ static void disti_warm_drifts(disti_warm *warm, int h)
         int x = i % warm->tile->width, y = i / warm->tile->width, asks = disti_warm_asks(warm, x, y);
         float f = warm->tape->value[pixel], drift = 3e38f, spread = 3e38f;
         if (warm->drift[i] < 2e38f || !disti_warm_misses_still(warm, i)) continue;
-        if (h > 2 ? !disti_silhouette_node(warm->tile, x, y, h) : h == 2 && (!asks || f > far)) continue;
+        if (h > 2 ? !disti_is_node(warm->tile, x, y, h) : h == 2 && (!asks || f > far)) continue;
         if (h == 8 && f > clamp && ((unsigned)((x ^ y) / 8) + warm->tape->turn) % 4u != 0) drift = 0.0f;
         if (h < 8 && f > far) drift = disti_warm_drift(warm, i, 8, f);
         if (h < 4 && f > 0.4f * far && drift > 2e38f) drift = disti_warm_drift(warm, i, 4, f);
@@ -14162,11 +14275,12 @@ static void disti_render_task(void *arg, int index, int worker)
         bench.stats->steepest = 0.0f;
         if (job->warm) bench.cones = 0; /* its memory is put to another use */
         if (job->warm) disti_render_warm(job, worker, &tile, &bench);
-        if (job->lattice) disti_trace_lattice(tracer, worker, &tile, &bench);
-        else disti_trace_all(tracer, worker, &bench, (size_t)n);
+        open |= job->warm;
+        if (open && job->lattice) disti_trace_lattice(tracer, worker, &tile, &bench);
+        else if (open) disti_trace_all(tracer, worker, &bench, (size_t)n);
         int proven = tracer->how.certified && !(bench.stats->steepest > 0.0f);
         bench.stats->steepest = DISTI_MAX(bench.stats->steepest, steepest);
-        if (job->out->error || job->out->stats) {
+        if (open && (job->out->error || job->out->stats)) {
             if (!proven) disti_trace_doubt(tracer, &tile, &bench);
             if (disti_is_coarse(tracer->field)) disti_coarse_doubt(tracer, &tile, &bench);
         }

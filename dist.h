@@ -12116,9 +12116,9 @@ typedef struct disti_minima {
     float near, far; /* rays with f below near are fitted one by one; from far on those of every 4th pixel do for all */
     float plateau;   /* from this f on the field may be clamped, and f between nodes is all the same */
     int *cells[2];   /* first pixels of blocks between nodes, of this round and of the next */
-    int *close;      /* rays with f of at most far */
+    int *close;      /* rays with f of at most far; at first all whose least |f| is looked for */
     int *fits;       /* rays that are to be fitted: width > 0 */
-    size_t close_count, fit_count;
+    size_t cell_count, close_count, fit_count;
 } disti_minima;
 
 enum { DISTI_NODE = 4 }; /* pixels between nodes; the tile's last row and column have some, too */
@@ -12239,7 +12239,7 @@ static int disti_is_node(const disti_tile *tile, int x, int y, int h)
 /* The next node's column or row after that at `at`, of nodes h apart below `end`. */
 static int disti_node_after(int at, int h, int end)
 {
-    return at == end - 1 ? end : DISTI_MIN((at / h + 1) * h, end - 1);
+    return at == end - 1 ? end : DISTI_MIN((at | (h - 1)) + 1, end - 1);
 }
 
 /* Four nodes and what they say about the pixels between. A node whose own minimum is elsewhere on the ray (of another
@@ -12361,10 +12361,8 @@ static void disti_minima_nodes(disti_minima *m)
 {
     const disti_bench *bench = m->bench;
     int w = m->tile->width, height = m->tile->height;
-    size_t cell_count = 0;
+    size_t cell_count = m->cell_count;
     disti_minima_first(m);
-    for (int y = 0; y < height; y += 2 * DISTI_NODE)
-        for (int x = 0; x < w; x += 2 * DISTI_NODE) m->cells[0][cell_count++] = y * w + x;
     for (int h = DISTI_NODE, round = 0; h >= 1; h /= 2, round ^= 1) {
         const int *cells = m->cells[round];
         int *next = m->cells[round ^ 1];
@@ -12508,11 +12506,30 @@ static void disti_minima_sweep(disti_minima *m)
     }
 }
 
+/* Lists the rays whose least |f| is looked for, and the blocks that have one. */
+static void disti_minima_begin(disti_minima *m)
+{
+    int w = m->tile->width, height = m->tile->height, h = 2 * DISTI_NODE;
+    for (int y0 = 0; y0 < height; y0 += h) {
+        for (int x0 = 0; x0 < w; x0 += h) {
+            int x1 = DISTI_MIN(x0 + h, w), y1 = DISTI_MIN(y0 + h, height);
+            size_t before = m->close_count;
+            for (int y = y0; y < y1; y++) {
+                for (int i = y * w + x0; i < y * w + x1; i++) {
+                    m->bench->rays[i].moved = 0;
+                    m->close[m->close_count] = i;
+                    m->close_count += (size_t)disti_wants_minimum(&m->bench->rays[i]);
+                }
+            }
+            if (m->close_count > before) m->cells[0][m->cell_count++] = y0 * w + x0;
+        }
+    }
+}
+
 static void disti_silhouette(const disti_tracer *tracer, int worker, const disti_tile *tile, const disti_bench *bench)
 {
     disti_minima minima, *m = &minima;
     size_t at = 0;
-    int n = tile->width * tile->height;
     float radius = tracer->field->radius, clamp = tracer->field->clamp, pixel = disti_pixel_width(tracer, tile);
     memset(m, 0, sizeof *m);
     m->tracer = tracer;
@@ -12531,11 +12548,13 @@ static void disti_silhouette(const disti_tracer *tracer, int worker, const disti
     m->close = (int *)disti_take(bench->rest, &at, DISTI_TILE_RAYS, sizeof(int));
     m->fits = (int *)disti_take(bench->rest, &at, DISTI_TILE_RAYS, sizeof(int));
     DIST_ASSERT(at <= (size_t)DISTI_REST_BYTES);
-    for (int i = 0; i < n; i++) bench->rays[i].moved = 0;
-    disti_minima_nodes(m);
-    for (int i = 0; i < n; i++)
-        if (disti_wants_minimum(&bench->rays[i]) && !(bench->rays[i].fbest > m->far)) m->close[m->close_count++] = i;
+    disti_minima_begin(m);
     if (m->close_count == 0) return;
+    disti_minima_nodes(m);
+    size_t all = m->close_count;
+    m->close_count = 0;
+    for (size_t i = 0; i < all; i++)
+        if (!(bench->rays[m->close[i]].fbest > m->far)) m->close[m->close_count++] = m->close[i];
     disti_minima_look(m, m->far);
     disti_minima_look(m, m->near);
     disti_minima_outline(m);
@@ -13265,6 +13284,7 @@ typedef struct disti_warm {
     float *drift;         /* of each miss that was asked: how its least f has changed; 3e38: not known */
     unsigned char *open;  /* 1: not decided by the cones; 2: and its hit was not where it was looked for */
     unsigned char *ask;   /* DISTI_ASK_* */
+    unsigned char *row;   /* of the tile: i / width */
     float change, mean;   /* largest change of f in the tile, no less than its mean over the picture */
     float typical;        /* mean change of f at every 8th hit */
     unsigned calm;        /* disti_warm_calm */
@@ -13272,9 +13292,15 @@ typedef struct disti_warm {
     size_t count, awaited; /* of bench->index; of these, with the first three DISTI_ASK_* */
 } disti_warm;
 
+static int disti_warm_y(const disti_warm *warm, int i) { return warm->row[i]; }
+
+static int disti_warm_x(const disti_warm *warm, int i) { return i - warm->row[i] * warm->tile->width; }
+
 static size_t disti_warm_pixel(const disti_warm *warm, int i)
 {
-    return disti_tile_pixel(warm->tile, i);
+    const disti_tile *tile = warm->tile;
+    size_t x = (size_t)(tile->x + disti_warm_x(warm, i)), y = (size_t)(tile->y + disti_warm_y(warm, i));
+    return y * (size_t)tile->view->width + x;
 }
 
 /* How much rarer than after `period` turns pixels are marched anew, 1 to 4: what may come up unseen grows with what the
@@ -13290,7 +13316,7 @@ static unsigned disti_warm_calm(float change, float radius)
    each 16 x 32; no later than that where `calm` changes meanwhile. */
 static int disti_warm_due(const disti_warm *warm, int i, unsigned period)
 {
-    unsigned x = (unsigned)(i % warm->tile->width), y = (unsigned)(i / warm->tile->width);
+    unsigned x = (unsigned)disti_warm_x(warm, i), y = (unsigned)disti_warm_y(warm, i);
     unsigned place = x % 8u + y % 16u * 8u + x / 8u % 2u * 128u + y / 16u % 2u * 256u;
     return (place * 27u + warm->tape->turn) % (period * warm->calm) == 0;
 }
@@ -13364,7 +13390,7 @@ static int disti_warm_again(disti_warm *warm, int i)
     warm->open[i] = 2;
     warm->ask[i] = DISTI_ASK_MARCH;
     if (!warm->late) return 0;
-    return disti_predict(warm->tracer, warm->tile, warm->bench, i % warm->tile->width, i / warm->tile->width, 1);
+    return disti_predict(warm->tracer, warm->tile, warm->bench, disti_warm_x(warm, i), disti_warm_y(warm, i), 1);
 }
 
 /* Ray i goes on as if it had been marched to s, where f was found. */
@@ -13438,7 +13464,8 @@ static float disti_warm_slower(const disti_warm *warm, int slopes, int i, int k)
    differ, 3e38 if one is not known. */
 static float disti_warm_guess(const disti_warm *warm, const float *moved, int slopes, int i, float *spread)
 {
-    int width = warm->tile->width, height = warm->tile->height, x = i % width, y = i / width, known = 0;
+    int width = warm->tile->width, height = warm->tile->height, known = 0;
+    int x = disti_warm_x(warm, i), y = disti_warm_y(warm, i);
     float sum = 0.0f, weights = 0.0f, low = 3e38f, high = -3e38f;
     for (int k = 0; k < 4; k++) {
         int right = k & 1, down = k >> 1, cx = (x & ~7) + 8 * right, cy = (y & ~7) + 8 * down;
@@ -13455,10 +13482,17 @@ static float disti_warm_guess(const disti_warm *warm, const float *moved, int sl
     return weights > 0.0f ? sum / weights : 3e38f;
 }
 
-/* Whether the pixel is one of the quarter that is asked this turn. */
+/* Where the quarter of the pixels begins that is asked this turn: two bits, the offset along x and y. */
+static unsigned disti_warm_phase(const disti_warm *warm)
+{
+    unsigned turn = warm->tape->turn & 3u;
+    return turn ^ turn >> 1;
+}
+
+/* Whether the pixel is one of them. */
 static int disti_warm_asks(const disti_warm *warm, int x, int y)
 {
-    unsigned turn = warm->tape->turn & 3u, phase = turn ^ turn >> 1; /* two bits: the offset along x and y */
+    unsigned phase = disti_warm_phase(warm);
     return ((unsigned)x & 1u) == (phase & 1u) && ((unsigned)y & 1u) == phase >> 1;
 }
 
@@ -13466,8 +13500,8 @@ static int disti_warm_asks(const disti_warm *warm, int x, int y)
    they differ, 3e38 if too few are known. */
 static float disti_warm_between(const disti_warm *warm, const float *moves, int slopes, int i, float *spread)
 {
-    int width = warm->tile->width, height = warm->tile->height, x = i % width, y = i / width, known = 0, all = 0,
-        border = 0;
+    int width = warm->tile->width, height = warm->tile->height, known = 0, all = 0, border = 0;
+    int x = disti_warm_x(warm, i), y = disti_warm_y(warm, i);
     float low = 3e38f, high = -3e38f, sum = 0.0f;
     for (int dy = -1; dy <= 1; dy++) {
         for (int dx = -1; dx <= 1; dx++) {
@@ -13496,41 +13530,47 @@ static float disti_warm_between(const disti_warm *warm, const float *moves, int 
     return mean;
 }
 
+/* Pixel i if it is a hit, in one of the passes of disti_warm_hits. */
+static void disti_warm_look(disti_warm *warm, int i, int pass)
+{
+    size_t pixel = disti_warm_pixel(warm, i);
+    float spread = 3e38f, wide = 3e38f, s = warm->tape->s[pixel], move = 0.0f;
+    if (!disti_warm_falls(warm, pixel)) return; /* as disti_warm_expects */
+    for (int slopes = 0; slopes < 2 && pass > 0; slopes++) { /* the one by which the neighbors differ less */
+        float apart = 3e38f, *least = &spread, other = 3e38f;
+        if (pass == 2) other = disti_warm_between(warm, warm->moved, slopes, i, &apart);
+        if (apart > 2e38f && spread > 2e38f) {
+            other = disti_warm_guess(warm, warm->moved, slopes, i, &apart);
+            least = &wide;
+        }
+        if (slopes && !(apart < *least)) continue;
+        move = other;
+        *least = apart;
+    }
+    if (move > 2e38f) move = 0.0f;
+    if (!disti_warm_expects(warm, i, s + move) || disti_warm_due(warm, i, DISTI_WARM_HITS)) return;
+    disti_ray *ray = &warm->bench->rays[i];
+    float epsilon = disti_ray_epsilon(warm->tracer, ray, s);
+    ray->slope = warm->tape->value[pixel];
+    unsigned other = (unsigned)(disti_warm_x(warm, i) / 2 + disti_warm_y(warm, i) / 2) + warm->tape->turn / 4u;
+    if (pass == 1 && wide <= epsilon && other % 4u != 0) spread = wide;
+    /* amid others at a crease; where the picture has hardly moved, those may have mended old errors of theirs */
+    float unlike = DISTI_MAX(-3.0f * warm->typical / ray->slope, move < 0.0f ? -move : move);
+    float within = ray->slope > -0.45f * warm->tracer->lipschitz ? 32.0f : 8.0f; /* what is flat may move alone */
+    float error = (within - warm->tracer->lipschitz / ray->slope) * epsilon + 2.0f * spread + unlike;
+    if (spread <= 5.0f * epsilon) disti_warm_hit(warm, i, s + move, 0.0f, error);
+    else disti_warm_list(warm, i, DISTI_ASK_NEWTON, s + move);
+}
+
 /* The hits: every 8th (pass 0), the quarter that is asked, the others, which have moved as those around have, or as f
    changed there over their own slope. */
 static void disti_warm_hits(disti_warm *warm, int pass)
 {
-    for (int i = 0; i < warm->n; i++) {
-        int x = i % warm->tile->width, y = i / warm->tile->width;
-        if (pass == 0 ? (x | y) & 7 : disti_warm_asks(warm, x, y) == (pass == 2)) continue;
-        size_t pixel = disti_warm_pixel(warm, i);
-        float spread = 3e38f, wide = 3e38f, s = warm->tape->s[pixel], move = 0.0f;
-        if (!disti_warm_falls(warm, pixel)) continue; /* as disti_warm_expects */
-        for (int slopes = 0; slopes < 2 && pass > 0; slopes++) { /* the one by which the neighbors differ less */
-            float apart = 3e38f, *least = &spread, other = 3e38f;
-            if (pass == 2) other = disti_warm_between(warm, warm->moved, slopes, i, &apart);
-            if (apart > 2e38f && spread > 2e38f) {
-                other = disti_warm_guess(warm, warm->moved, slopes, i, &apart);
-                least = &wide;
-            }
-            if (slopes && !(apart < *least)) continue;
-            move = other;
-            *least = apart;
-        }
-        if (move > 2e38f) move = 0.0f;
-        if (!disti_warm_expects(warm, i, s + move) || disti_warm_due(warm, i, DISTI_WARM_HITS)) continue;
-        disti_ray *ray = &warm->bench->rays[i];
-        float epsilon = disti_ray_epsilon(warm->tracer, ray, s);
-        ray->slope = warm->tape->value[pixel];
-        unsigned other = ((unsigned)(x / 2 + y / 2) + warm->tape->turn / 4u) & 3u;
-        if (pass == 1 && wide <= epsilon && other != 0) spread = wide;
-        /* amid others at a crease; where the picture has hardly moved, those may have mended old errors of theirs */
-        float unlike = DISTI_MAX(-3.0f * warm->typical / ray->slope, move < 0.0f ? -move : move);
-        float within = ray->slope > -0.45f * warm->tracer->lipschitz ? 32.0f : 8.0f; /* what is flat may move alone */
-        float error = (within - warm->tracer->lipschitz / ray->slope) * epsilon + 2.0f * spread + unlike;
-        if (spread <= 5.0f * epsilon) disti_warm_hit(warm, i, s + move, 0.0f, error);
-        else disti_warm_list(warm, i, DISTI_ASK_NEWTON, s + move);
-    }
+    int width = warm->tile->width, step = pass == 0 ? 8 : pass == 1 ? 2 : 1;
+    unsigned phase = pass == 1 ? disti_warm_phase(warm) : 0;
+    for (int y = (int)(phase >> 1); y < warm->tile->height; y += step)
+        for (int x = (int)(phase & 1u); x < width; x += step)
+            if (pass < 2 || !disti_warm_asks(warm, x, y)) disti_warm_look(warm, y * width + x, pass);
 }
 
 /* Whether a third of the `tried` first hits were found, and f has changed little there. */
@@ -13653,7 +13693,7 @@ static int disti_warm_misses_still(const disti_warm *warm, int i)
    within a quarter of what changes at all or .003 of f itself. 3e38: not known. */
 static float disti_warm_drift(const disti_warm *warm, int i, int h, float f)
 {
-    int width = warm->tile->width, height = warm->tile->height, x = i % width, y = i / width;
+    int width = warm->tile->width, height = warm->tile->height, x = disti_warm_x(warm, i), y = disti_warm_y(warm, i);
     int x0 = x / h * h, x1 = DISTI_MIN(x0 + h, width - 1), y0 = y / h * h, y1 = DISTI_MIN(y0 + h, height - 1);
     float u = (float)(x - x0) / (float)DISTI_MAX(x1 - x0, 1), v = (float)(y - y0) / (float)DISTI_MAX(y1 - y0, 1);
     float a = warm->drift[y0 * width + x0], b = warm->drift[y0 * width + x1], c = warm->drift[y1 * width + x0],
@@ -13669,20 +13709,24 @@ static float disti_warm_drift(const disti_warm *warm, int i, int h, float f)
 static void disti_warm_drifts(disti_warm *warm, int h)
 {
     const dist_field *field = warm->tracer->field;
+    int width = warm->tile->width, height = warm->tile->height, every = h > 2 ? h : 1;
     float clamp = 1.5f * (field->clamp > 0.0f ? field->clamp : 0.1f * field->radius), far = 0.05f * field->radius;
-    for (int i = 0; i < warm->n && warm->silhouette && !warm->due; i++) {
-        size_t pixel = disti_warm_pixel(warm, i);
-        int x = i % warm->tile->width, y = i / warm->tile->width, asks = disti_warm_asks(warm, x, y);
-        float f = warm->tape->value[pixel], drift = 3e38f, spread = 3e38f;
-        if (warm->drift[i] < 2e38f || !disti_warm_misses_still(warm, i)) continue;
-        if (h > 2 ? !disti_is_node(warm->tile, x, y, h) : h == 2 && (!asks || f > far)) continue;
-        if (h == 8 && f > clamp && ((unsigned)((x ^ y) / 8) + warm->tape->turn) % 4u != 0) drift = 0.0f;
-        if (h < 8 && f > far) drift = disti_warm_drift(warm, i, 8, f);
-        if (h < 4 && f > 0.4f * far && drift > 2e38f) drift = disti_warm_drift(warm, i, 4, f);
-        if (h == 1 && drift > 2e38f) drift = disti_warm_between(warm, warm->drift, 0, i, &spread);
-        if (spread < 2e38f && !(spread < DISTI_MAX(0.25f * warm->change, 3e-3f * f))) drift = 3e38f;
-        warm->drift[i] = drift;
-        if (drift > 2e38f) disti_warm_list(warm, i, DISTI_ASK_DRIFT, warm->tape->s[pixel]);
+    if (!warm->silhouette || warm->due) return;
+    for (int y = 0; y < height; y = disti_node_after(y, every, height)) {
+        for (int x = 0; x < width; x = disti_node_after(x, every, width)) {
+            int i = y * width + x;
+            if (warm->drift[i] < 2e38f || (h == 2 && !disti_warm_asks(warm, x, y))) continue;
+            size_t pixel = disti_warm_pixel(warm, i);
+            float f = warm->tape->value[pixel], drift = 3e38f, spread = 3e38f;
+            if ((h == 2 && f > far) || !disti_warm_misses_still(warm, i)) continue;
+            if (h == 8 && f > clamp && ((unsigned)((x ^ y) / 8) + warm->tape->turn) % 4u != 0) drift = 0.0f;
+            if (h < 8 && f > far) drift = disti_warm_drift(warm, i, 8, f);
+            if (h < 4 && f > 0.4f * far && drift > 2e38f) drift = disti_warm_drift(warm, i, 4, f);
+            if (h == 1 && drift > 2e38f) drift = disti_warm_between(warm, warm->drift, 0, i, &spread);
+            if (spread < 2e38f && !(spread < DISTI_MAX(0.25f * warm->change, 3e-3f * f))) drift = 3e38f;
+            warm->drift[i] = drift;
+            if (drift > 2e38f) disti_warm_list(warm, i, DISTI_ASK_DRIFT, warm->tape->s[pixel]);
+        }
     }
 }
 
@@ -13690,7 +13734,7 @@ static void disti_warm_drifts(disti_warm *warm, int h)
    a quarter more; without any, by the most that it changed in the tile. */
 static float disti_warm_loss(const disti_warm *warm, int i, float s)
 {
-    int width = warm->tile->width, x = i % width, y = i / width, known = 0;
+    int width = warm->tile->width, x = disti_warm_x(warm, i), y = disti_warm_y(warm, i), known = 0;
     float away = 0.05f * warm->tracer->field->radius, low = 0.0f;
     for (int v = DISTI_MAX(y - 2, 0); v <= DISTI_MIN(y + 2, warm->tile->height - 1); v++) {
         for (int u = DISTI_MAX(x - 2, 0); u <= DISTI_MIN(x + 2, width - 1); u++) {
@@ -13710,8 +13754,7 @@ static float disti_warm_loss(const disti_warm *warm, int i, float s)
 static void disti_warm_misses(disti_warm *warm, int pass)
 {
     for (int i = 0; i < warm->n; i++) {
-        int x = i % warm->tile->width, y = i / warm->tile->width;
-        if (!warm->silhouette && disti_warm_asks(warm, x, y) == pass) continue;
+        if (!warm->silhouette && disti_warm_asks(warm, disti_warm_x(warm, i), disti_warm_y(warm, i)) == pass) continue;
         size_t pixel = disti_warm_pixel(warm, i);
         disti_ray *ray = &warm->bench->rays[i];
         int blocked = ray->mode != DISTI_DONE, inside = warm->tape->status[pixel] & 15;
@@ -13722,13 +13765,13 @@ static void disti_warm_misses(disti_warm *warm, int pass)
             ray->kept = 1;
             continue;
         }
-        if ((warm->due && !blocked) || !disti_warm_misses_still(warm, i)) continue;
+        int told = warm->silhouette && !warm->due; /* by disti_warm_drifts */
+        if (told ? warm->drift[i] > 2e38f : !(blocked || !warm->due) || !disti_warm_misses_still(warm, i)) continue;
         float epsilon = disti_ray_epsilon(warm->tracer, ray, ray->start);
         float unsure = warm->silhouette ? 1.5f * warm->change : disti_warm_loss(warm, i, warm->tape->s[pixel]);
-        float lower = warm->silhouette && !warm->due ? f + warm->drift[i] : f - unsure;
+        float lower = told ? f + warm->drift[i] : f - unsure;
         ray->best = warm->tape->s[pixel];
         ray->moved = 0;
-        if (lower > 2e38f) continue;
         int near = blocked && (warm->due || lower < unsure + 3.0f * epsilon);
         float spread = 3e38f, drift = 3e38f;
         if (near && pass && !warm->silhouette) drift = disti_warm_between(warm, warm->drift, 0, i, &spread);
@@ -13766,7 +13809,7 @@ static int disti_warm_beside(disti_warm *warm, int i, int fresh)
     warm->ask[i] = DISTI_ASK_NOTHING;
     if (disti_warm_clear(warm, i, fresh)) return 0;
     int hit = warm->moved[i] < 2e38f && s < ray->best, miss = ray->status == DIST_RAY_MISS && ray->kept;
-    int turn = (i % warm->tile->width + i / warm->tile->width + (int)(warm->tape->turn & 1u)) & 1;
+    int turn = (disti_warm_x(warm, i) + disti_warm_y(warm, i) + (int)(warm->tape->turn & 1u)) & 1;
     if (!(hit || miss) || !(turn || (hit && warm->calm == 1))) return 0;
     if (!warm->open[i] || ray->mode != DISTI_DONE || s <= ray->start || s >= ray->leave) return 0;
     ray->q = s;
@@ -13783,7 +13826,7 @@ static int disti_warm_least(disti_warm *warm, int i, float f)
     disti_ray *ray = &warm->bench->rays[i];
     float epsilon = disti_ray_epsilon(warm->tracer, ray, ray->best), radius = warm->tracer->field->radius;
     float margin = 5.0f * (warm->change + epsilon), value = warm->tape->value[disti_warm_pixel(warm, i)];
-    int x = i % warm->tile->width, y = i / warm->tile->width, turn = (int)(warm->tape->turn & 7u);
+    int x = disti_warm_x(warm, i), y = disti_warm_y(warm, i), turn = (int)(warm->tape->turn & 7u);
     int first = disti_warm_asks(warm, x, y) && (x / 2 + y / 2 + turn / 4) & 1, odd = (i + y + turn) & 1;
     int same = f > 0.9f * value && f < 1.1f * value && !first; /* as where a plateau all but reaches 0 */
     int still = !warm->silhouette && warm->change < 1e-3f * radius && value > 0.0f &&
@@ -13977,7 +14020,7 @@ static void disti_warm_doubt(disti_warm *warm)
         warm->ask[at] = DISTI_ASK_KNOWN;
         if (ray->status != DIST_RAY_HIT || !(ray->best < expected - far)) continue;
         for (int k = 0; k < 9; k++) {
-            int x = at % width + k % 3 - 1, y = at / width + k / 3 - 1, i = y * width + x;
+            int x = disti_warm_x(warm, at) + k % 3 - 1, y = disti_warm_y(warm, at) + k / 3 - 1, i = y * width + x;
             if (x < 0 || y < 0 || x >= width || y >= warm->tile->height || !bench->rays[i].kept) continue;
             const disti_ray *beside = &bench->rays[i];
             disti_warm_refresh(warm, i, beside->status == DIST_RAY_HIT ? beside->best : beside->leave);
@@ -14009,9 +14052,11 @@ static void disti_render_warm(const disti_render_job *job, int worker, const dis
     warm.drift = warm.moved + warm.n;
     warm.open = bench->rest + (size_t)warm.n * 2 * sizeof(float);
     warm.ask = warm.open + warm.n;
+    warm.row = warm.ask + warm.n;
     size_t before, left = 0;
     for (int i = 0; i < warm.n; i++) {
         warm.moved[i] = warm.drift[i] = 3e38f;
+        warm.row[i] = (unsigned char)(i / tile->width);
         warm.open[i] = bench->rays[i].mode != DISTI_DONE;
         warm.ask[i] = DISTI_ASK_NOTHING;
         bench->depth[i] = 0.0f;

@@ -93,8 +93,10 @@ enum {
 DIST_API const char *dist_version(void);
 
 /* Memory. alloc_fn returns `bytes` bytes aligned to `alignment` (a power of two, at most 64) or NULL; free_fn gets the
-   same pointer and size back, never NULL. Called only inside create, load and extract functions and destroy; like
-   every hook, it may use this library with other contexts than the one that calls it.
+   same pointer and size back, never NULL. Called by create, load, save and destroy functions, those that make meshes
+   or measure them, dist_shape_set_texture, dist_net_set_half and, for a field of your own with a code of more than 992
+   numbers, by the first call that wants its gradient; by no other. Like every hook, it may use this library with other
+   contexts than the one that calls it.
    Either both functions or none; none: malloc and free. */
 typedef struct dist_allocator {
     void *user;
@@ -219,8 +221,9 @@ typedef struct dist_field {
     float coarse_error;
     float center[3]; /* bounding sphere: the surface lies inside it, nothing is looked for outside */
     float radius;    /* 1e-15 to 1e15 */
-    float lipschitz;     /* bound or estimate of |grad f| where 0 < f < clamp / 2 (no clamp: radius / 20); 0: 1 */
-    float lipschitz_far; /* the same where f is larger; 0: lipschitz */
+    float lipschitz;        /* bound or estimate of |grad f| where 0 < f < lipschitz_within; 0: 1 */
+    float lipschitz_within; /* 0: clamp / 2; without a clamp radius / 20 */
+    float lipschitz_far;    /* the same where f is larger; 0: lipschitz */
     /* how.certified goes by these where they are larger than the two before, which may be those of most places: of a
        net by the steepest places that dist_shape_create found. certified_far 0: certified */
     float certified, certified_far;
@@ -249,6 +252,7 @@ typedef struct dist_field {
 
 /* f = distance to a sphere, to a torus around the y axis, to an axis-aligned box (half extents), exact; each within its
    bounding sphere. Their code is the list of numbers given, in that order, so that gradients can be tried on them.
+   A torus's distance is exact where the tube is no wider than the ring.
    The arrays are borrowed while the field is used. A size below 0 becomes field.radius, which every call refuses. */
 DIST_API dist_field dist_field_sphere(const float center_radius[4]);
 DIST_API dist_field dist_field_torus(const float center_radii[5]); /* x y z, ring radius, tube radius */
@@ -280,6 +284,7 @@ typedef struct dist_gradients {
 /* Adjoint of dist_field_eval: with L = sum_i d_sdf[i] f(points[i]), adds dL/dcode and dL/dweights to grads and
    d_sdf[i] * grad f(points[i]) to d_points (n, 3) unless NULL.
    d_sdf (n): the weights, in; with seed_fn it is filled from it instead: then value and adjoint cost one pass together.
+   Points that are not finite, or whose d_sdf is not, add nothing.
    grads is not NULL, even for d_points alone; what it holds of camera and color must be NULL. */
 DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *field, size_t n, const float *points,
                                          float *d_sdf, dist_seed_fn seed_fn, void *seed_user, float *d_points,
@@ -293,9 +298,9 @@ DIST_API dist_status dist_color_backward(dist_context *ctx, const dist_field *fi
                                          const float *d_color, float *d_points, const dist_gradients *grads);
 
 /* What makes f a distance: *loss = weight * mean over the n points of (|grad f| - 1)^2, and its gradient is added to
-   grads->code and ->weights. loss and grads may be NULL; what grads holds of camera and color must be. Points whose
-   gradient is not finite add nothing. Exact where the field has second_fn (a ReLU's kinks have no share, as in
-   automatic differentiation), else by differences over 1e-3 of the radius. */
+   grads->code and ->weights. loss and grads may be NULL; what grads holds of camera and color must be. Points that are
+   not finite, or whose gradient is not, add nothing. Exact where the field has second_fn (a ReLU's kinks have no share,
+   as in automatic differentiation), else by differences over 1e-3 of the radius. */
 DIST_API dist_status dist_field_eikonal(dist_context *ctx, const dist_field *field, size_t n, const float *points,
                                         float weight, float *loss, const dist_gradients *grads);
 #endif
@@ -307,8 +312,8 @@ typedef struct dist_similarity {
     float translation[3];
 } dist_similarity;
 
-/* scale *= exp(step[0]) (within 1e-30 to 1e30), rotation <- exp([step[1..3]]x) rotation, kept orthonormal,
-   translation += step[4..6]: the step for a gradient of a placement's seven numbers, against it as in
+/* scale *= exp(step[0]) (within 1e-30 to 1e30; one below 0 stays), rotation <- exp([step[1..3]]x) rotation, kept
+   orthonormal, translation += step[4..6]: the step for a gradient of a placement's seven numbers, against it as in
    dist_camera_move. */
 DIST_API void dist_similarity_move(dist_similarity *placement, const float step[7]);
 
@@ -325,7 +330,8 @@ typedef struct dist_instance {
    noise, 5e-7 of the scene's. Every point is held against every sphere: fast up to some hundred instances; more are
    better made scenes of scenes. Belongs to the context that made it. */
 typedef struct dist_scene dist_scene;
-/* NULL on failure. Instances may share fields; a scene's field may be an instance of another scene. */
+/* NULL on failure. Instances may share fields; a scene's field may be an instance of another scene. Takes 264 bytes for
+   each number of the scene's code, for sums of its gradient. */
 DIST_API dist_scene *dist_scene_create(dist_context *ctx, int count, const dist_instance *instances);
 DIST_API void dist_scene_destroy(dist_scene *scene);
 /* Moves an instance or replaces its field (NULL: it stays) by one whose code is as long and that has a color if the old
@@ -333,7 +339,8 @@ DIST_API void dist_scene_destroy(dist_scene *scene);
 DIST_API dist_status dist_scene_set(dist_scene *scene, int index, const dist_instance *instance);
 /* The scene as a field. Borrows the scene. No gradient for weights. Its code is, for each instance, its field's code
    (nothing if that has no adjoint), then its placement as dist_similarity_move has it: log-scale, w of
-   R' = exp([w]x) R, translation; dist_gradients.code gets the gradients for all of them. It has a color if every
+   R' = exp([w]x) R, translation; dist_gradients.code gets the gradients for all of them, with the bounding spheres of
+   scenes held where they are, which matters outside of those alone. It has a color if every
    instance has, with an adjoint if each has one; its color code is theirs one after another. The gradient of its
    normals is that of differences over how.normal_delta, of smooth nets, too. */
 DIST_API dist_field dist_scene_field(dist_scene *scene);
@@ -416,7 +423,8 @@ typedef struct dist_net_desc {
     int output_linear;/* 0: tanh at the end, 1: nothing */
     int levels;       /* Fourier levels beside the point: sin and cos of pi 2^k p, k below levels; at most 16 */
     int color;        /* 1: a texture: r, g, b in place of the distance, with a sigmoid at the end unless linear */
-    int geometric; /* 1: starts near the distance to a sphere of half the bound (ReLU, softplus); 0: PyTorch's start */
+    int geometric;    /* 1: starts near the distance to a sphere of half the bound (ReLU; softplus where scale * bound
+                         is some 30 or more), Fourier levels without a share in it; 0: PyTorch's start */
     float bound;      /* radius of the sphere that holds the shape, 1e-6 to 1e6; 0: 1 */
     float clamp;      /* 0: 0.1 with a code, none without */
     unsigned seed;
@@ -803,7 +811,7 @@ DIST_API dist_mesh *dist_mesh_create(dist_context *ctx, size_t vertex_count, con
 DIST_API void dist_mesh_destroy(dist_mesh *mesh);
 #ifndef DIST_NO_BACKWARD
 /* Adjoint of extraction: a vertex moves by dv = -n df / |grad f|, so d_vertices (vertex_count, 3) reaches the
-   field's code and weights. The camera's members of grads must be NULL. */
+   field's code and weights. The camera's and the color's members of grads must be NULL. */
 DIST_API dist_status dist_mesh_backward(dist_context *ctx, const dist_field *field, const dist_mesh *mesh,
                                         const float *d_vertices, const dist_gradients *grads);
 #endif
@@ -897,6 +905,13 @@ DIST_API size_t dist_workspace_bytes(const dist_workspace_desc *desc);
 #endif
 #if defined(DIST_NO_SIMD) || !(defined(__x86_64__) || defined(_M_X64) || defined(__aarch64__) || defined(_M_ARM64))
 #include <fenv.h> /* the rounding mode, where it stands in no register that is known here */
+#endif
+
+/* windows.h makes nothing of these words; the end of this file does so again. */
+#ifdef near
+#define DISTI_WORDS
+#undef near
+#undef far
 #endif
 
 #ifdef __cplusplus
@@ -1008,6 +1023,14 @@ DISTI_UNUSED static unsigned char disti_is_huge(float x)
     uint32_t bits;
     memcpy(&bits, &x, sizeof bits);
     return (bits & 0x7fffffffu) >= 0x5b800000u;
+}
+
+DISTI_UNUSED static float disti_nan(void)
+{
+    uint32_t bits = 0x7fc00000u;
+    float x;
+    memcpy(&x, &bits, sizeof x);
+    return x;
 }
 
 DISTI_UNUSED static int disti_finite_all(size_t n, const float *x)
@@ -2094,11 +2117,11 @@ DISTI_INLINE float disti_exp_falling(float x)
 DISTI_INLINE float disti_tanh(float x)
 {
     float s = x * x, e = disti_exp_falling(2.0f * x);
-    float small = x + x * s * ((((-5.70498872745e-3f * s + 2.06390887954e-2f) * s - 5.37397155531e-2f) * s +
+    float inner = x + x * s * ((((-5.70498872745e-3f * s + 2.06390887954e-2f) * s - 5.37397155531e-2f) * s +
                                 1.33314422036e-1f) * s - 3.33332819422e-1f);
     float large = (1.0f - e) * (1.0f / (1.0f + e));
     large = x < 0.0f ? -large : large;
-    return s < 0.390625f ? small : large;
+    return s < 0.390625f ? inner : large;
 }
 
 DISTI_INLINE float disti_sigmoid(float x)
@@ -4162,7 +4185,8 @@ static dist_status disti_cache_check(dist_context *ctx, const dist_field *field,
     float lipschitz = field->lipschitz > 0.0f ? field->lipschitz : 1.0f;
     if (cache->ctx != ctx) return disti_refuse(ctx, "%s: field.cache belongs to another context", function);
     int same = field->user == own->user && field->eval_fn == own->eval_fn && field->radius == own->radius &&
-               memcmp(field->center, own->center, sizeof field->center) == 0 && field->clamp == own->clamp;
+               memcmp(field->center, own->center, sizeof field->center) == 0 && field->clamp == own->clamp &&
+               field->lipschitz_within == own->lipschitz_within;
     if (!same || disti_changes(field) != cache->changes)
         return disti_refuse(ctx, "%s: field.cache was made of another field, or that has changed since; see "
                                  "dist_cache_update", function);
@@ -4193,7 +4217,9 @@ static dist_status disti_field_check(dist_context *ctx, const dist_field *field,
             return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.center[%d] is %d, must be within 1e15 of 0", function,
                               i, (double)field->center[i]);
     const disti_limit limits[] = {
-        {"field.lipschitz", (double)field->lipschitz, 0, 3e38}, {"field.detail", (double)field->detail, 0, 3e38},
+        {"field.lipschitz", (double)field->lipschitz, 0, 3e38},
+        {"field.lipschitz_within", (double)field->lipschitz_within, 0, 3e38},
+        {"field.detail", (double)field->detail, 0, 3e38},
         {"field.lipschitz_far", (double)field->lipschitz_far, 0, 3e38}, {"field.clamp", (double)field->clamp, 0, 3e38},
         {"field.certified", (double)field->certified, 0, 3e38},
         {"field.certified_far", (double)field->certified_far, 0, 3e38},
@@ -4324,6 +4350,18 @@ DIST_API dist_status dist_color_eval(dist_context *ctx, const dist_field *field,
 }
 
 /* Value, gradient, seeds and code adjoint of any field: fused where it can, else block by block. */
+/* adjoint_fn of the points that add something: neither they nor their seeds are NaN or infinite. */
+static void disti_field_adjoint(const dist_field *field, int worker, size_t n, const float *points, const float *d_sdf,
+                                double *d_code)
+{
+    for (size_t i = 0, first = 0; i <= n; i++) {
+        if (i < n && disti_finite(d_sdf[i]) && disti_finite_all(3, points + 3 * i)) continue;
+        if (i > first)
+            field->adjoint_fn(field->user, worker, i - first, points + 3 * first, d_sdf + first, d_code);
+        first = i + 1;
+    }
+}
+
 static void disti_field_fused(const dist_field *field, int worker, size_t n, const float *points, dist_seed_fn seed_fn,
                               void *seed_user, double *d_code)
 {
@@ -4336,7 +4374,7 @@ static void disti_field_fused(const dist_field *field, int worker, size_t n, con
         size_t count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK);
         field->eval_fn(field->user, worker, count, points + 3 * at, sdf, gradient);
         seed_fn(seed_user, at, count, sdf, gradient, d_sdf);
-        if (d_code) field->adjoint_fn(field->user, worker, count, points + 3 * at, d_sdf, d_code);
+        if (d_code) disti_field_adjoint(field, worker, count, points + 3 * at, d_sdf, d_code);
     }
 }
 
@@ -4628,20 +4666,26 @@ DIST_API dist_status dist_field_eikonal(dist_context *ctx, const dist_field *fie
     if (grads) status = disti_code_begin(ctx, field, grads, &d_code);
     int exact = field->second_fn && (!grads || !grads->weights || field->second_weights_fn);
     float *gradient = disti_chunk_scratch(ctx) + 14 * (size_t)DISTI_CHUNK, *sdf = gradient + 3 * (size_t)DISTI_CHUNK;
+    float *where = sdf + (size_t)DISTI_CHUNK; /* of the points that add something */
     for (size_t at = 0; at < n && status == DIST_OK; at += DISTI_CHUNK) {
-        size_t count = DISTI_MIN(n - at, (size_t)DISTI_CHUNK);
+        size_t count = DISTI_MIN(n - at, (size_t)DISTI_CHUNK), kept = 0;
         disti_field_eval_all(ctx, field, count, points + 3 * at, sdf, gradient);
         for (size_t i = 0; i < count; i++) {
             float *g = gradient + 3 * i, length = disti_length(g[0], g[1], g[2]), factor = 0.0f;
-            if (disti_finite(length)) {
+            if (disti_finite(length) && disti_finite_all(3, points + 3 * (at + i))) {
                 sum += ((double)length - 1.0) * ((double)length - 1.0);
                 if (length > 1e-12f) factor = 2.0f * weight * (1.0f - 1.0f / length) / (float)n;
             }
-            for (int k = 0; k < 3; k++) g[k] = factor == 0.0f ? 0.0f : factor * g[k];
+            if (!(factor < 0.0f || factor > 0.0f)) continue; /* 0 times what is not finite is none */
+            for (size_t k = 0; k < 3; k++) {
+                where[3 * kept + k] = points[3 * (at + i) + k];
+                gradient[3 * kept + k] = factor * g[k];
+            }
+            kept++;
         }
-        if (grads)
-            status = disti_field_second(ctx, field, count, points + 3 * at, gradient, exact ? 0 : 2,
-                                        1e-3f * field->radius, NULL, d_code, grads->weights);
+        if (grads && kept > 0)
+            status = disti_field_second(ctx, field, kept, where, gradient, exact ? 0 : 2, 1e-3f * field->radius, NULL,
+                                        d_code, grads->weights);
     }
     if (status == DIST_OK && loss) *loss = (float)((double)weight * sum / (double)n);
     if (status == DIST_OK && grads) disti_code_end(field, grads, d_code);
@@ -4650,8 +4694,11 @@ DIST_API dist_status dist_field_eikonal(dist_context *ctx, const dist_field *fie
 #endif
 
 /* |f| from which on lipschitz_far holds: a clamped training leaves slopes of no meaning beyond. */
+static int disti_is_coarse(const dist_field *field) { return field->coarse_fn && field->eval_fn == field->coarse_fn; }
+
 static float disti_far_from(const dist_field *field)
 {
+    if (field->lipschitz_within > 0.0f) return field->lipschitz_within;
     return field->clamp > 0.0f ? 0.5f * field->clamp : 0.05f * field->radius;
 }
 
@@ -4758,6 +4805,19 @@ static void disti_placed_local(const disti_placed *placed, const float *p, int o
     if (!outside) return;
     float share = placed->field.radius / disti_length(q[0] - c[0], q[1] - c[1], q[2] - c[2]);
     for (int i = 0; i < 3; i++) q[i] = c[i] + share * (q[i] - c[i]);
+}
+
+/* Adjoint of that: y, of what is asked, becomes that of q: y <- r / |q - c| (y - n (n . y)), n = (q - c) / |q - c|. */
+static void disti_placed_unproject(const disti_placed *placed, const float *p, float y[3])
+{
+    const float *c = placed->field.center, radius = placed->field.radius;
+    float q[3], n[3];
+    disti_placed_local(placed, p, 0, q);
+    for (int i = 0; i < 3; i++) n[i] = q[i] - c[i];
+    float away = disti_length(n[0], n[1], n[2]);
+    if (!(away > radius)) return;
+    float along = (n[0] * y[0] + n[1] * y[1] + n[2] * y[2]) / away;
+    for (int i = 0; i < 3; i++) y[i] = radius / away * (y[i] - along * n[i] / away);
 }
 
 /* f_i at p, d from the sphere in the world, where the field answered f. */
@@ -5051,6 +5111,7 @@ static void disti_scene_unpaint(const disti_placed *placed, int worker, const di
     for (size_t i = 0; i < count; i++) {
         size_t at = 3 * (size_t)w->order[j + i];
         double g[3];
+        disti_placed_unproject(placed, points + at, y + 3 * i);
         for (size_t k = 0; k < 3; k++) {
             const float *row = placed->rotation + 3 * k;
             g[k] = (double)(row[0] * y[3 * i] + row[1] * y[3 * i + 1] + row[2] * y[3 * i + 2]) / (double)placed->scale;
@@ -5324,11 +5385,17 @@ DIST_API dist_field dist_scene_field(dist_scene *scene)
         float clamp = f->clamp * scene->placed[k].scale;
         float detail = (f->detail > 0.0f ? f->detail : f->radius) * scene->placed[k].scale;
         if (!(field.detail > 0.0f && field.detail < detail)) field.detail = detail;
+        float within = disti_far_from(f) * scene->placed[k].scale;
+        if (!(field.lipschitz_within > 0.0f && field.lipschitz_within < within)) field.lipschitz_within = within;
         field.lipschitz = DISTI_MAX(field.lipschitz, f->lipschitz);
         field.lipschitz_far = DISTI_MAX(field.lipschitz_far, disti_steepest(f));
         field.certified = DISTI_MAX(field.certified, f->certified);
         field.certified_far = DISTI_MAX(field.certified_far, DISTI_MAX(f->certified, f->certified_far));
         if (clamp > 0.0f && !(field.clamp > 0.0f && field.clamp < clamp)) field.clamp = clamp;
+        if (disti_is_coarse(f)) {
+            field.coarse_fn = field.eval_fn;
+            field.coarse_error = DISTI_MAX(field.coarse_error, f->coarse_error * scene->placed[k].scale);
+        }
         known = known && f->cost > 0.0f;
         field.cost = known ? DISTI_MIN(field.cost + f->cost, 2e38f) : 0.0f;
         if (!f->color_fn) field.color_fn = NULL;
@@ -5396,7 +5463,7 @@ DIST_API void dist_similarity_move(dist_similarity *placement, const float step[
     if (memcmp(placement->rotation, zero, sizeof zero) == 0)
         placement->rotation[0] = placement->rotation[4] = placement->rotation[8] = 1.0f;
     double scale = (double)placement->scale * exp((double)step[0]);
-    placement->scale = (float)(scale < 1e-30 ? 1e-30 : scale > 1e30 ? 1e30 : scale);
+    if (placement->scale > 0.0f) placement->scale = (float)(scale < 1e-30 ? 1e-30 : scale > 1e30 ? 1e30 : scale);
     disti_turn(step + 1, placement->rotation);
     for (int i = 0; i < 3; i++) placement->translation[i] += step[4 + i];
 }
@@ -6885,6 +6952,18 @@ static void disti_fold_sum(const dist_shape *shape, disti_block *b, const float 
     if (index % 16 == 15) disti_fold_flush(net, b);
 }
 
+/* Points that are not finite, or with a seed that is not (n, each), add nothing to the code: 0 times NaN would. */
+static void disti_fold_drop(const dist_shape *shape, const disti_block *b, size_t n, const float *points, size_t each,
+                            const float *seed)
+{
+    size_t rows = (size_t)shape->net->fold_count * (size_t)shape->net->max_rows;
+    if (disti_finite_all(3 * n, points) && disti_finite_all(each * n, seed)) return;
+    for (size_t c = 0; c < n; c++) {
+        if (disti_finite_all(3, points + 3 * c) && disti_finite_all(each, seed + each * c)) continue;
+        for (size_t row = 0; row < rows; row++) b->fold_delta[row * DISTI_BLOCK + c] = 0.0f;
+    }
+}
+
 /* Whether few points go through kernels.few. */
 static int disti_net_few(const dist_shape *shape, size_t n)
 {
@@ -7233,7 +7312,10 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
         if (gradient) memcpy(gradient + 3 * at, own.pull, 3 * count * sizeof(float));
         if (!seed_fn) continue;
         seed_fn(seed_user, at, count, block->value, own.pull, own.seed);
-        if (d_code) disti_fold_sum(shape, block, own.seed, at / DISTI_BLOCK);
+        if (!d_code) continue;
+        disti_fold_drop(shape, block, count, points + 3 * at, 1, own.seed);
+        for (size_t c = 0; c < count; c++) own.seed[c] = disti_finite(own.seed[c]) ? own.seed[c] : 0.0f;
+        disti_fold_sum(shape, block, own.seed, at / DISTI_BLOCK);
     }
     if (d_code) disti_fold_backward(shape, &own, 0, (size_t)net->code_size, d_code);
 }
@@ -7601,8 +7683,11 @@ static void disti_shape_color_adjoint_fn(void *user, int worker, size_t n, const
         disti_block_begin(paint, worker, &b, count, points + 3 * at);
         disti_color_reverse(paint, worker, &b, count, d_color + 3 * at, NULL);
         if (d_points) disti_encode_backward(paint, &b, b.pull);
-        for (size_t i = 0; d_points && i < 3 * count; i++) d_points[3 * at + i] += b.pull[i];
-        if (d_code || d_color_code) disti_fold_sum(paint, &b, NULL, at / DISTI_BLOCK);
+        for (size_t i = 0; d_points && i < 3 * count; i++)
+            if (disti_finite(b.pull[i])) d_points[3 * at + i] += b.pull[i];
+        if (!d_code && !d_color_code) continue;
+        disti_fold_drop(paint, &b, count, points + 3 * at, 3, d_color + 3 * at);
+        disti_fold_sum(paint, &b, NULL, at / DISTI_BLOCK);
     }
     if (d_code) disti_fold_backward(paint, &b, 0, own, d_code);
     if (d_color_code) disti_fold_backward(paint, &b, own, (size_t)net->code_size - own, d_color_code);
@@ -7702,20 +7787,34 @@ static void disti_weights_block(void *arg, int index, int worker)
     size_t at = job->first + (size_t)index * job->block;
     size_t count = DISTI_MIN(job->n - at, job->block);
     float *store = shape->ctx->store + (size_t)index * shape->store_block_size;
+    float points[3 * DISTI_BLOCK], d_color[3 * DISTI_BLOCK];
+    for (size_t c = 0; c < count; c++) { /* what is not finite becomes a point without a seed, which adds nothing */
+        const float *p = job->points + 3 * (at + c), *d = job->d_color ? job->d_color + 3 * (at + c) : p;
+        int good = disti_finite_all(3, p) && disti_finite_all(3, d);
+        for (size_t k = 0; k < 3; k++) {
+            points[3 * c + k] = good ? p[k] : 0.0f;
+            d_color[3 * c + k] = good ? d[k] : 0.0f;
+        }
+    }
     if (job->directions) {
         disti_second_block(shape, worker, &b, count, job->points + 3 * at, job->directions + 3 * at, store);
     } else {
-        disti_block_begin(shape, worker, &b, count, job->points + 3 * at);
+        disti_block_begin(shape, worker, &b, count, points);
         if (job->d_color) {
-            disti_color_reverse(shape, worker, &b, count, job->d_color + 3 * at, store);
+            disti_color_reverse(shape, worker, &b, count, d_color, store);
         } else {
             const float *x = disti_net_forward(shape, &b, store, disti_counter_of(shape->ctx, worker));
             float *seed = b.seed;
             disti_net_output(shape, &b, x, net->sdf_channel);
+            for (size_t c = 0; c < count; c++)
+                if (!disti_finite_all(3, job->points + 3 * (at + c))) b.value[c] = disti_nan();
             if (job->seed_fn) job->seed_fn(job->seed_user, at, count, b.value, NULL, seed);
             else memcpy(seed, job->d_sdf + at, count * sizeof(float));
             if (job->seed_fn && job->d_sdf) memcpy(job->d_sdf + at, seed, count * sizeof(float));
-            for (size_t c = 0; c < DISTI_BLOCK; c++) seed[c] = c < count ? seed[c] * b.value_slope[c] : 0.0f;
+            for (size_t c = 0; c < DISTI_BLOCK; c++) {
+                int good = c < count && disti_finite(b.value[c]) && disti_finite(seed[c]);
+                seed[c] = good ? seed[c] * b.value_slope[c] : 0.0f;
+            }
             disti_net_reverse(shape, &b, seed, store);
         }
         disti_encode_backward(shape, &b, b.pull);
@@ -9077,7 +9176,7 @@ static double disti_normal(uint64_t *state)
 
 /* PyTorch's start: uniform within 1 / sqrt(in). SIREN's: within 1 / in at first, sqrt(6 / in) / omega then.
    Geometric (Atzmon and Lipman 2020): normal, sigma sqrt(2 / out), the last layer's mean sqrt(pi / in), bias -radius;
-   code and skipped-in columns 0, so that f starts near |p| - radius. */
+   columns of the code, of Fourier levels and skipped-in ones 0, so that f starts near |p| - radius. */
 static void disti_net_randomize(dist_net *net, const dist_net_desc *desc)
 {
     uint64_t state = ((uint64_t)desc->seed << 1 | 1) * 0x9e3779b97f4a7c15u;
@@ -9091,11 +9190,12 @@ static void disti_net_randomize(dist_net *net, const dist_net_desc *desc)
             for (int k = 0; k < layer->in; k++) {
                 int is_code = k >= layer->code_column && k < layer->code_column + layer->code;
                 int is_point = k >= layer->point_column && k < layer->point_column + layer->point;
+                int is_level = is_point && k >= layer->point_column + 3;
                 double x = (2.0 * disti_random_unit(&state) - 1.0) * range;
                 if (desc->geometric) {
                     x = last ? sqrt(3.14159265358979 / in) + 1e-4 * disti_normal(&state)
                              : disti_normal(&state) * sqrt(2.0 / layer->out);
-                    if (is_code || (l > 0 && is_point)) x = 0.0;
+                    if (is_code || is_level || (l > 0 && is_point)) x = 0.0;
                 }
                 w[k] = (float)x;
             }
@@ -9466,8 +9566,6 @@ typedef struct disti_tracer {
     const dist_cache *cache; /* that rays are to use; NULL: none */
     float shy;               /* by how much less than it says a ball of it is trusted: to where |f| is epsilon */
 } disti_tracer;
-
-static int disti_is_coarse(const dist_field *field) { return field->coarse_fn && field->eval_fn == field->coarse_fn; }
 
 DIST_API dist_render_desc dist_render_desc_resolve(const dist_render_desc *desc)
 {
@@ -9866,7 +9964,8 @@ static float disti_ray_jump(const disti_tracer *tracer, const disti_ray *ray, fl
     float cap = 3.0f * radius + epsilon;
     if (solid || beyond <= cap) return solid ? 0.0f : beyond;
     /* short of the end: f must still be positive there, or something came in between */
-    if (ray->f < 5e-3f * tracer->field->radius) cap = DISTI_MAX(cap, 1e-2f * tracer->field->radius);
+    if (DISTI_MAX(ray->f, radius) < 5e-3f * tracer->field->radius)
+        cap = DISTI_MAX(cap, 1e-2f * tracer->field->radius);
     return DISTI_MIN(0.97f * jump, cap);
 }
 
@@ -9886,11 +9985,12 @@ static int disti_ray_step(const disti_tracer *tracer, disti_ray *ray)
     float relaxed = (certified ? 1.95f : 1.8f) / (1.0f - DISTI_MIN(slope, 0.75f));
     float stretch = ray->known || told ? DISTI_MAX(1.0f, relaxed) : tracer->how.step_scale;
     float step = radius * DISTI_MIN(stretch, 8.0f), jump = 0.0f;
-    if ((ray->known || told) && slope < -0.05f && ray->f < 0.05f * tracer->field->radius)
+    int local = ray->fa > 0.0f; /* the slope; one over what was skipped says nothing of what comes next */
+    int tells = told || (ray->known && (local || certified));
+    if (tells && slope < -0.05f && DISTI_MAX(ray->f, radius) < 0.05f * tracer->field->radius)
         jump = disti_ray_jump(tracer, ray, told ? -ray->incline : -ray->slope, radius);
     int mode = jump > 0.0f ? DISTI_JUMP : DISTI_MARCH;
     if (jump > 0.0f) step = jump;
-    int local = ray->fa > 0.0f; /* the slope; one over what was skipped says nothing of a pixel */
     if (ray->known && local && slope > -0.3f) { /* but not through a surface that the slope foretells */
         float floor = disti_ray_floor(tracer, ray);
         if (slope < 0.0f) floor = DISTI_MIN(floor, 0.9f * ray->f / -ray->slope);
@@ -12118,7 +12218,8 @@ typedef struct disti_minima {
     int *cells[2];   /* first pixels of blocks between nodes, of this round and of the next */
     int *close;      /* rays with f of at most far; at first all whose least |f| is looked for */
     int *fits;       /* rays that are to be fitted: width > 0 */
-    size_t cell_count, close_count, fit_count;
+    int *fronts[2];  /* rays that are held against their neighbors, in this round and in the next: side = 1 */
+    size_t cell_count, close_count, fit_count, front_count;
 } disti_minima;
 
 enum { DISTI_NODE = 4 }; /* pixels between nodes; the tile's last row and column have some, too */
@@ -12411,6 +12512,15 @@ static void disti_rays_beside(const disti_minima *m, int index, const disti_ray 
     other[3] = y > 0 ? ray - w : NULL;
 }
 
+static int disti_minima_beside_hit(const disti_minima *m, int index)
+{
+    const disti_ray *other[4];
+    disti_rays_beside(m, index, other);
+    for (int k = 0; k < 4; k++)
+        if (other[k] && other[k]->status == DIST_RAY_HIT) return 1;
+    return 0;
+}
+
 /* Rays also look where their neighbors' least samples are. */
 static void disti_minima_look(const disti_minima *m, float limit)
 {
@@ -12436,15 +12546,83 @@ static void disti_minima_outline(disti_minima *m)
 {
     for (int fine = 0; fine <= (m->pixel > 0.01f * m->radius); fine++) {
         for (size_t i = 0; i < m->close_count; i++) {
-            const disti_ray *ray = &m->bench->rays[m->close[i]], *other[4];
+            const disti_ray *ray = &m->bench->rays[m->close[i]];
             int fitted = ray->moved == DISTI_FITTED, good = fabsf(ray->fbest - ray->fb) < 0.02f * ray->fbest;
-            int wanted = ray->fbest < m->near;
             if (fine ? !fitted || good : fitted) continue;
-            if (!wanted) disti_rays_beside(m, m->close[i], other);
-            for (int k = 0; k < 4 && !wanted; k++) wanted = other[k] && other[k]->status == DIST_RAY_HIT;
-            if (wanted) disti_minima_want_fit(m, m->close[i], fine ? 0.1f : 0.35f);
+            if (ray->fbest < m->near || disti_minima_beside_hit(m, m->close[i]))
+                disti_minima_want_fit(m, m->close[i], fine ? 0.1f : 0.35f);
         }
         disti_minima_fit(m);
+    }
+}
+
+static size_t disti_minima_push(disti_minima *m, int *front, size_t count, int index)
+{
+    disti_ray *ray = &m->bench->rays[index];
+    if (ray->side || !disti_wants_minimum(ray)) return count;
+    ray->side = 1;
+    front[count] = index;
+    return count + 1;
+}
+
+/* From one pixel to the next the least |f| changes by no more than the Lipschitz figure times what they are apart
+   there; at a hit it is 0. A ray that has more than that, fb, found another minimum: it looks where its neighbor has
+   its own, at distance *t. */
+static int disti_minima_amiss(const disti_minima *m, int index, float *t)
+{
+    disti_ray *ray = &m->bench->rays[index];
+    const disti_ray *other[4];
+    float least = DISTI_MIN(ray->fbest, m->far);
+    int found = 0;
+    disti_rays_beside(m, index, other);
+    for (int k = 0; k < 4; k++) {
+        int hit = other[k] && other[k]->status == DIST_RAY_HIT;
+        if (!hit && !(other[k] && disti_has_minimum(other[k]))) continue;
+        float at = disti_ray_distance(other[k]), f = hit ? 0.0f : fabsf(other[k]->fbest);
+        float most = f + 2.1f * m->tracer->lipschitz * ray->footprint * at;
+        if (!(most < least)) continue;
+        ray->fb = least = most;
+        *t = at;
+        found = 1;
+    }
+    return found;
+}
+
+/* Looks from neighbor to neighbor, from those that are close and those beside hits on, as long as that finds less. */
+static void disti_minima_spread(disti_minima *m)
+{
+    int w = m->tile->width, *front = m->fronts[0], *next = m->fronts[1];
+    size_t fronts = m->front_count;
+    for (size_t i = 0; i < m->close_count; i++) fronts = disti_minima_push(m, front, fronts, m->close[i]);
+    while (fronts > 0) {
+        size_t count = 0, found = 0;
+        for (size_t i = 0; i < fronts; i++) {
+            disti_ray *ray = &m->bench->rays[front[i]];
+            float t = 0.0f;
+            ray->side = 0;
+            ray->fa = ray->fbest;
+            if (disti_minima_amiss(m, front[i], &t)) count = disti_minima_list_at(m, front[i], t, count);
+        }
+        memcpy(front, m->bench->index, count * sizeof(int));
+        disti_minima_ask(m, count);
+        for (size_t i = 0; i < count; i++) {
+            const disti_ray *ray = &m->bench->rays[front[i]];
+            if (!(fabsf(ray->fbest) < 0.9f * fabsf(ray->fa))) continue;
+            if (ray->fbest < m->near || ray->fbest > ray->fb) disti_minima_want_fit(m, front[i], 0.35f);
+            front[found++] = front[i];
+        }
+        disti_minima_fit(m);
+        fronts = 0;
+        for (size_t i = 0; i < found; i++) {
+            int x = front[i] % w, y = front[i] / w;
+            if (x > 0) fronts = disti_minima_push(m, next, fronts, front[i] - 1);
+            if (x + 1 < w) fronts = disti_minima_push(m, next, fronts, front[i] + 1);
+            if (y > 0) fronts = disti_minima_push(m, next, fronts, front[i] - w);
+            if (y + 1 < m->tile->height) fronts = disti_minima_push(m, next, fronts, front[i] + w);
+        }
+        int *last = front;
+        front = next;
+        next = last;
     }
 }
 
@@ -12516,7 +12694,7 @@ static void disti_minima_begin(disti_minima *m)
             size_t before = m->close_count;
             for (int y = y0; y < y1; y++) {
                 for (int i = y * w + x0; i < y * w + x1; i++) {
-                    m->bench->rays[i].moved = 0;
+                    m->bench->rays[i].moved = m->bench->rays[i].side = 0;
                     m->close[m->close_count] = i;
                     m->close_count += (size_t)disti_wants_minimum(&m->bench->rays[i]);
                 }
@@ -12547,6 +12725,8 @@ static void disti_silhouette(const disti_tracer *tracer, int worker, const disti
     m->cells[1] = (int *)disti_take(bench->rest, &at, DISTI_NODE_CELLS, sizeof(int));
     m->close = (int *)disti_take(bench->rest, &at, DISTI_TILE_RAYS, sizeof(int));
     m->fits = (int *)disti_take(bench->rest, &at, DISTI_TILE_RAYS, sizeof(int));
+    m->fronts[0] = (int *)disti_take(bench->rest, &at, DISTI_TILE_RAYS, sizeof(int));
+    m->fronts[1] = (int *)disti_take(bench->rest, &at, DISTI_TILE_RAYS, sizeof(int));
     DIST_ASSERT(at <= (size_t)DISTI_REST_BYTES);
     disti_minima_begin(m);
     if (m->close_count == 0) return;
@@ -12555,9 +12735,11 @@ static void disti_silhouette(const disti_tracer *tracer, int worker, const disti
     m->close_count = 0;
     for (size_t i = 0; i < all; i++)
         if (!(bench->rays[m->close[i]].fbest > m->far)) m->close[m->close_count++] = m->close[i];
+        else if (disti_minima_beside_hit(m, m->close[i]))
+            m->front_count = disti_minima_push(m, m->fronts[0], m->front_count, m->close[i]);
     disti_minima_look(m, m->far);
-    disti_minima_look(m, m->near);
     disti_minima_outline(m);
+    disti_minima_spread(m);
     disti_minima_sweep(m);
 }
 
@@ -12687,7 +12869,8 @@ static void disti_paper_finish(const disti_tracer *tracer, disti_ray *ray)
     else if (before && !first && ray->a < 0.0f) ray->status = DIST_RAY_INSIDE;
     else if (before) ray->status = DIST_RAY_UNRESOLVED;
     /* behind the camera by more than rounding: f < 0 at first, so it went back */
-    int hit = ray->status == DIST_RAY_HIT, behind = hit && ray->base + (double)ray->best < -(double)tracer->noise;
+    int hit = ray->status == DIST_RAY_HIT, ends = hit || ray->status == DIST_RAY_UNRESOLVED;
+    int behind = ends && ray->base + (double)ray->best < -(double)tracer->noise;
     if (behind || ray->status == DIST_RAY_INSIDE) {
         disti_ray_end(ray, DIST_RAY_INSIDE, ray->enter, ray->a, 0.0f);
         return;
@@ -12695,7 +12878,8 @@ static void disti_paper_finish(const disti_tracer *tracer, disti_ray *ray)
     ray->error = before && ray->status == DIST_RAY_UNRESOLVED
                      ? DISTI_MAX(ray->leave - ray->best, ray->best - ray->enter) /* steps may have gone too far */
                      : magnitude;
-    if (hit) ray->best = DISTI_MAX(ray->best + disti_clamp(f, 0.1f * tracer->field->radius), (float)-ray->base);
+    if (hit) ray->best += disti_clamp(f, 0.1f * tracer->field->radius);
+    ray->best = DISTI_MAX(ray->best, (float)-ray->base);
 }
 
 /* Traces one tile. samples (rays, how.samples, 4) may be NULL; it is written for every ray. */
@@ -12761,10 +12945,11 @@ enum { DISTI_RUN = (int)DISTI_SLOTS * DISTI_BLOCK }; /* pixels whose colors and 
 /* One point of the backward pass. */
 typedef struct disti_entry {
     float d_distance;   /* dL/d(distance along the ray), field units */
+    float d_motion;     /* the same from what is seen there, normal and color: not weighted */
     float d_sdf;        /* dL/df at this point from elsewhere: silhouette, the paper's samples */
     float d_depth;      /* dL/d(depth), which the ray's tilt alone changes too */
     float direction[3]; /* of the ray, field space */
-    float weight;       /* of the implicit rule: |n . v| in the normal mode, 1 else */
+    float weight;       /* of d_distance and d_depth: |n . v| in the normal mode, 1 else */
     unsigned char capped;
 } disti_entry;
 
@@ -14573,7 +14758,7 @@ static void disti_render_seed(void *user, size_t first, size_t count, const floa
         entry->capped = !disti_finite(length); /* nothing comes of a point whose gradient overflows */
         d_sdf[i] = entry->capped ? 0.0f : entry->d_sdf;
         entry->weight = 1.0f;
-        if (entry->d_distance == 0.0f && !entry->capped) continue;
+        if (entry->d_distance == 0.0f && entry->d_motion == 0.0f && !entry->capped) continue;
         if (entry->capped || !(length > 1e-30f)) {
             entry->capped = 1;
             entry->weight = 0.0f;
@@ -14586,7 +14771,8 @@ static void disti_render_seed(void *user, size_t first, size_t count, const floa
         if (mode == DIST_GRADIENT_NORMAL) entry->weight = magnitude;
         float bounded = DISTI_MAX(magnitude, least);
         /* at along = 0 the sign is that of a ray that enters */
-        d_sdf[i] += (along > 0.0f ? -1.0f : 1.0f) * entry->d_distance * entry->weight / (bounded * length);
+        float d_t = entry->d_distance * entry->weight + entry->d_motion;
+        d_sdf[i] += (along > 0.0f ? -1.0f : 1.0f) * d_t / (bounded * length);
         if (disti_finite(d_sdf[i])) continue;
         d_sdf[i] = entry->weight = 0.0f;
         entry->capped = 1;
@@ -14683,11 +14869,12 @@ static void disti_backward_flush(disti_render_backward_job *job)
 }
 
 static void disti_backward_add(disti_render_backward_job *job, const disti_ray *ray, const float *point,
-                               float d_distance, float d_depth, float d_sdf)
+                               float d_distance, float d_motion, float d_depth, float d_sdf)
 {
     const dist_tape *tape = job->tape;
     disti_entry *entry = &tape->entry[job->count];
     entry->d_distance = d_distance;
+    entry->d_motion = d_motion;
     entry->d_depth = d_depth;
     entry->d_sdf = d_sdf;
     memcpy(entry->direction, ray->direction, sizeof entry->direction);
@@ -14749,26 +14936,28 @@ static void disti_backward_pixel(disti_render_backward_job *job, size_t pixel, f
         disti_add_pull(job, nearest, pull, (double)d_depth);
         d_depth = 0.0f;
     }
-    if (d_point) d_distance += disti_backward_hit(job, &ray, p, d_point);
-    float motion = d_bend ? disti_backward_hit(job, &ray, p, d_bend) : 0.0f;
-    if (!paper) d_distance += motion;
+    float d_motion = d_point ? disti_backward_hit(job, &ray, p, d_point) : 0.0f;
+    if (paper) d_distance += d_motion, d_motion = 0.0f;
+    float bends = d_bend ? disti_backward_hit(job, &ray, p, d_bend) : 0.0f;
+    if (!paper) d_motion += bends;
     if (tape->sample) {
         const float *samples = tape->sample + pixel * (size_t)tape->samples * 4;
         for (int k = 0; k < (paper ? tape->samples : 1); k++) {
             float f = samples[4 * k], seed = k == 0 ? d_silhouette : 0.0f;
             int inside_clamp = (f < 0.0f ? -f : f) <= 0.1f * field->radius;
             if (paper && inside_clamp) seed += disti_paper_alpha(&tracer->how) * d_distance;
-            if (seed != 0.0f) disti_backward_add(job, &ray, samples + 4 * k + 1, 0.0f, 0.0f, seed);
+            if (seed != 0.0f) disti_backward_add(job, &ray, samples + 4 * k + 1, 0.0f, 0.0f, 0.0f, seed);
         }
-        if (!paper && d_distance != 0.0f) disti_backward_add(job, &ray, p, d_distance, d_depth, 0.0f);
+        if (!paper && (d_distance != 0.0f || d_motion != 0.0f))
+            disti_backward_add(job, &ray, p, d_distance, d_motion, d_depth, 0.0f);
         return;
     }
     if (paper) { /* all K samples are the hit */
         d_silhouette += tracer->how.step_scale * (float)tracer->how.samples * d_distance;
         d_distance = 0.0f;
     }
-    if (d_distance != 0.0f || d_silhouette != 0.0f)
-        disti_backward_add(job, &ray, p, d_distance, d_depth, d_silhouette);
+    if (d_distance != 0.0f || d_motion != 0.0f || d_silhouette != 0.0f)
+        disti_backward_add(job, &ray, p, d_distance, d_motion, d_depth, d_silhouette);
 }
 
 /* Upstream gradients that are not finite count as 0. */
@@ -14932,7 +15121,7 @@ static void disti_backward_outline(disti_render_backward_job *job, size_t first,
     }
     memset(&ray, 0, sizeof ray); /* a seed asks for no direction */
     for (size_t i = 0; i < n; i++)
-        if (seed[i] != 0.0f) disti_backward_add(job, &ray, p + 3 * i, 0.0f, 0.0f, seed[i]);
+        if (seed[i] != 0.0f) disti_backward_add(job, &ray, p + 3 * i, 0.0f, 0.0f, 0.0f, seed[i]);
 }
 
 static void disti_backward_pixels(disti_render_backward_job *job)
@@ -16455,9 +16644,15 @@ DIST_API float *dist_pfm_load(dist_context *ctx, const char *path, int *width, i
 #endif
 
 #ifndef DIST_NO_MESH
+/* Lines end with LF, CR LF or CR. */
+static int disti_is_line_end(char c)
+{
+    return c == '\n' || c == '\r';
+}
+
 static int disti_is_blank(char c)
 {
-    return disti_is_space(c) && c != '\n';
+    return disti_is_space(c) && !disti_is_line_end(c);
 }
 
 static void disti_skip_blank(disti_text *t)
@@ -16467,7 +16662,8 @@ static void disti_skip_blank(disti_text *t)
 
 static void disti_skip_line(disti_text *t)
 {
-    while (t->at < t->end && *t->at != '\n') t->at++;
+    while (t->at < t->end && !disti_is_line_end(*t->at)) t->at++;
+    if (t->end - t->at > 1 && t->at[0] == '\r' && t->at[1] == '\n') t->at++;
     if (t->at < t->end) t->at++;
 }
 
@@ -16559,7 +16755,7 @@ static int disti_read_obj(disti_mesh_text *r)
         for (size_t k = 0; face; k++) {
             int64_t i = 0;
             disti_skip_blank(t);
-            if (t->at == t->end || *t->at == '\n' || *t->at == '#') break;
+            if (t->at == t->end || disti_is_line_end(*t->at) || *t->at == '#') break;
             if (!disti_text_integer(t, &i) || i == 0 || (t->at < t->end && *t->at != '/' && !disti_is_space(*t->at)))
                 return disti_mesh_fail(r, DIST_BAD_FILE, "not a corner of a face", 0);
             while (t->at < t->end && !disti_is_space(*t->at)) t->at++; /* texture and normal */
@@ -16622,7 +16818,7 @@ typedef struct disti_ply_property {
 
 typedef struct disti_ply_element {
     int64_t count;
-    int vertex, first, last; /* properties first..last-1 */
+    int vertex, face, first, last; /* properties first..last-1 */
 } disti_ply_element;
 
 typedef struct disti_ply {
@@ -16679,9 +16875,10 @@ static int disti_ply_element_line(disti_mesh_text *r, disti_ply *ply)
         return disti_mesh_fail(r, DIST_UNSUPPORTED, "more than 16 PLY elements", 0);
     ply->element_count++;
     element->vertex = disti_ply_word(t, "vertex");
+    element->face = disti_ply_word(t, "face");
     element->first = element->last = ply->property_count;
     disti_skip_blank(t);
-    while (t->at < t->end && !element->vertex && !disti_is_space(*t->at)) t->at++;
+    while (t->at < t->end && !element->vertex && !element->face && !disti_is_space(*t->at)) t->at++;
     disti_skip_blank(t);
     if (disti_text_integer(t, &element->count) && element->count >= 0) return 1;
     return disti_mesh_fail(r, DIST_BAD_FILE, "not the count of a PLY element", 0);
@@ -16775,6 +16972,8 @@ static int disti_read_ply(disti_mesh_text *r)
         for (int i = element->first; i < element->last; i++) roles |= 1 << ply.properties[i].role;
         if (element->vertex && (roles & 7) != 7)
             return disti_mesh_fail(r, DIST_BAD_FILE, "the PLY vertices have no x, y and z", 0);
+        if (element->face && element->count > 0 && !(roles >> DISTI_PLY_INDICES & 1))
+            return disti_mesh_fail(r, DIST_BAD_FILE, "the PLY faces have no list vertex_indices", 0);
         if (roles == 0) continue; /* no properties: no bytes, whatever the count says */
         for (int64_t i = 0; i < element->count; i++)
             if (!disti_ply_item(r, &ply, element)) return 0;
@@ -16792,12 +16991,15 @@ static dist_mesh *disti_mesh_parse(dist_context *ctx, const char *label, const v
     r.mesh = disti_mesh_new(ctx);
     if (!r.mesh) return NULL;
     int good;
-    if (size > 4 && memcmp(bytes, "ply", 3) == 0 && disti_is_space(r.begin[3])) {
+    if (size > 3 && memcmp(bytes, "\357\273\277", 3) == 0) r.text.at += 3; /* some editors mark UTF-8 so */
+    const char *text = r.text.at;
+    size = (size_t)(r.text.end - text);
+    if (size > 4 && memcmp(text, "ply", 3) == 0 && disti_is_space(text[3])) {
         good = disti_read_ply(&r);
     } else {
-        size_t prefix = size > 4 && r.begin[0] == 'C' ? 1 : 0; /* C: colors, N: normals behind the coordinates */
-        prefix += size > 4 + prefix && r.begin[prefix] == 'N';
-        int off = size > 3 + prefix && memcmp(r.begin + prefix, "OFF", 3) == 0 && disti_is_space(r.begin[prefix + 3]);
+        size_t prefix = size > 4 && text[0] == 'C' ? 1 : 0; /* C: colors, N: normals behind the coordinates */
+        prefix += size > 4 + prefix && text[prefix] == 'N';
+        int off = size > 3 + prefix && memcmp(text + prefix, "OFF", 3) == 0 && disti_is_space(text[prefix + 3]);
         if (off) r.text.at += prefix + 3;
         good = off ? disti_read_off(&r) : disti_read_obj(&r);
     }
@@ -17088,6 +17290,11 @@ DIST_API size_t dist_workspace_bytes(const dist_workspace_desc *desc)
 
 #ifdef __cplusplus
 }
+#endif
+
+#ifdef DISTI_WORDS
+#define near
+#define far
 #endif
 
 #endif /* DIST_IMPLEMENTED */

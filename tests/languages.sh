@@ -56,6 +56,9 @@ program() {
     fi
 }
 
+# After windows.h, which defines these words.
+expect words_of_windows $CC -std=c99 $warnings -Dnear= -Dfar= -Dsmall=char -Dhyper=int -Dinterface=struct \
+    -DSMALL_LIBRARY -fsyntax-only tests/small.c
 plain=-DDIST_NO_SIMD # it compiles three times as fast
 program one_file $CC $plain -DDIST_IMPLEMENTATION tests/small.c
 program included_before_and_after_the_implementation $CC $plain -DDIST_IMPLEMENTATION -DSMALL_TWICE tests/small.c

@@ -93,6 +93,32 @@ TEST(rays_find_what_they_find_without_a_cache_for_fewer_queries)
     dist_context_destroy(ctx);
 }
 
+/* The slope over what a cache skipped says nothing of what comes next: a ray that jumped by it went through a shell. */
+TEST(rays_do_not_go_through_thin_shells_by_what_a_cache_skipped)
+{
+    dist_context *ctx = shape_context();
+    test_shape shape = shape_make(SHAPE_SHELLS, 0.04, 0, 0, 0);
+    dist_field field = shape_field(&shape, 1, 1);
+    dist_cache *cache = dist_cache_create(ctx, &field, 32);
+    dist_field with = dist_cache_field(cache);
+    test_random random = test_random_seed(3);
+    int lost = 0, hits = 0;
+    for (int round = 0; round < (test_quick() ? 8 : 30); round++) {
+        make_rays(&random, &shape, RAYS, origins, directions);
+        CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, RAYS, origins, directions, NULL, plain, NULL), ctx);
+        CHECK_STATUS(DIST_OK, dist_trace(ctx, &with, RAYS, origins, directions, NULL, cached, NULL), ctx);
+        for (int i = 0; i < RAYS; i++) {
+            hits += plain[i].status == DIST_RAY_HIT;
+            lost += plain[i].status == DIST_RAY_HIT && cached[i].status == DIST_RAY_MISS;
+        }
+    }
+    CHECK(hits > 10000);
+    CHECK_EQUAL(0, lost);
+    if (test_state.verbose) printf("    %d of %d hits are misses with the cache\n", lost, hits);
+    dist_cache_destroy(cache);
+    dist_context_destroy(ctx);
+}
+
 /* Networks, whose Lipschitz figures are sampled; with what is to be found again by a certified ray. */
 TEST(rays_of_networks_find_what_they_find_without_a_cache)
 {
@@ -508,6 +534,7 @@ int main(int argc, char **argv)
     test_begin(argc, argv);
     RUN(what_a_cache_shows_empty_is);
     RUN(rays_find_what_they_find_without_a_cache_for_fewer_queries);
+    RUN(rays_do_not_go_through_thin_shells_by_what_a_cache_skipped);
     RUN(rays_of_networks_find_what_they_find_without_a_cache);
     RUN(spheres_that_are_clear_of_the_surface_ask_nothing);
     RUN(pictures_are_the_same_with_and_without_a_cache);

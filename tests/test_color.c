@@ -481,6 +481,32 @@ TEST(color_backward_of_pictures_matches_differences)
     }
 }
 
+/* DIST_GRADIENT_NORMAL weights what depth pulls on, nothing of what colors do. */
+TEST(color_backward_is_the_same_where_depth_is_weighted_by_the_normal)
+{
+    static float g[2][MOST];
+    static pictures a;
+    static image_job job;
+    scene s;
+    scene_open(&s, 0, 1);
+    for (int weighted = 0; weighted < 2; weighted++) {
+        dist_render_desc how;
+        memset(&how, 0, sizeof how);
+        how.background_color[1] = 0.5f;
+        how.gradient = weighted ? DIST_GRADIENT_NORMAL : DIST_GRADIENT_IMPLICIT;
+        dist_tape_destroy(pictures_take(&a, &s));
+        pixels_choose(&s, &a, &job);
+        dist_tape *tape = dist_tape_create(s.ctx, &s.camera, &how);
+        CHECK_STATUS(DIST_OK, dist_render(s.ctx, &s.field, &s.camera, &how, &a.out, tape), s.ctx);
+        dist_gradients grads = gradients_of(&s, g[weighted]);
+        CHECK_STATUS(DIST_OK, dist_render_backward(s.ctx, tape, &a.d_out, &grads), s.ctx);
+        dist_tape_destroy(tape);
+    }
+    CHECK(g[0][MOVE] < 0.0f || g[0][MOVE] > 0.0f);
+    CHECK_BYTES(sizeof g[0], g[0], g[1]);
+    scene_close(&s);
+}
+
 TEST(color_backward_of_placed_shapes_matches_differences)
 {
     static float g[MOST];
@@ -946,6 +972,7 @@ int main(int argc, char **argv)
     test_begin(argc, argv);
     RUN(color_backward_at_points_matches_differences);
     RUN(color_backward_of_pictures_matches_differences);
+    RUN(color_backward_is_the_same_where_depth_is_weighted_by_the_normal);
     RUN(color_backward_of_placed_shapes_matches_differences);
     RUN(a_color_code_is_recovered_from_one_picture_with_either_tracer);
     RUN(color_gradients_have_the_same_bits_for_every_number_of_workers_and_whatever_else_is_wanted);

@@ -351,6 +351,27 @@ TEST(binary_ply_of_mixed_types_is_read)
 #define PLY "ply\nformat ascii 1.0\n"
 #define XYZ "property float x\nproperty float y\nproperty float z\n"
 
+TEST(lines_end_as_they_like_and_a_mark_of_utf8_is_no_vertex)
+{
+    static const char *const files[] = {
+        "v 0 0 0\rv 1 0 0\rv 0 1 0\rf 1 2 3\r",
+        "v 0 0 0\r\nv 1 0 0\r\nv 0 1 0\r\nf 1 2 3\r\n",
+        "\357\273\277v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
+        "\357\273\277OFF\r3 1 0\r0 0 0\r1 0 0\r0 1 0\r3 0 1 2\r",
+        "ply\rformat ascii 1.0\relement vertex 3\rproperty float x\rproperty float y\rproperty float z\r"
+        "element face 1\rproperty list uchar int vertex_index\rend_header\r0 0 0\r1 0 0\r0 1 0\r3 0 1 2\r"};
+    dist_context *ctx = test_context();
+    for (size_t i = 0; i < sizeof files / sizeof files[0]; i++) {
+        dist_mesh *mesh = dist_mesh_read(ctx, files[i], strlen(files[i]));
+        REQUIRE(mesh != NULL);
+        CHECK_EQUAL(3, mesh->vertex_count);
+        CHECK_EQUAL(1, mesh->triangle_count);
+        CHECK_NEAR(1, mesh->vertices[3], 0);
+        dist_mesh_destroy(mesh);
+    }
+    dist_context_destroy(ctx);
+}
+
 TEST(mesh_files_that_mean_harm_are_refused_with_a_sentence)
 {
     dist_context *ctx = test_context();
@@ -359,6 +380,9 @@ TEST(mesh_files_that_mean_harm_are_refused_with_a_sentence)
         "\n",
         "ply",
         "ply\n",
+        "\357\273\277",
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+        "element face 1\nproperty list uchar int indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n",
         "OFF",
         "OFF\n",
         "OFF BINARY\n",
@@ -640,6 +664,7 @@ int main(int argc, char **argv)
     RUN(normals_are_written_to_both_formats);
     RUN(every_dialect_reads_as_the_same_square);
     RUN(binary_ply_of_mixed_types_is_read);
+    RUN(lines_end_as_they_like_and_a_mark_of_utf8_is_no_vertex);
     RUN(mesh_files_that_mean_harm_are_refused_with_a_sentence);
     RUN(mutated_meshes_never_crash_leak_or_take_much_memory);
     RUN(mutated_pictures_never_crash);

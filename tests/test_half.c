@@ -488,6 +488,17 @@ TEST(error_bounds_count_in_what_any_coarse_fn_is_off)
         field.coarse_fn = wavy_torus;
         field.eval_fn = wavy_torus;
         check_bounds(ctx, "torus", torus, field, 64 << j % 3);
+        dist_instance one;
+        memset(&one, 0, sizeof one);
+        one.placement.scale = 3.0f;
+        one.field = &torus;
+        dist_scene *exact = dist_scene_create(ctx, 1, &one);
+        one.field = &field;
+        dist_scene *rough = dist_scene_create(ctx, 1, &one);
+        CHECK_NEAR(3 * (double)off[j / 3], dist_scene_field(rough).coarse_error, 1e-6);
+        check_bounds(ctx, "torus in a scene", dist_scene_field(exact), dist_scene_field(rough), 64 << j % 3);
+        dist_scene_destroy(exact);
+        dist_scene_destroy(rough);
         const float wrong[] = {-1e30f, (float)NAN, (float)INFINITY};
         for (int k = 0; k < 3; k++) {
             float f, p[3] = {0.0f, 0.0f, 0.0f};

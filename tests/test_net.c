@@ -707,14 +707,15 @@ TEST(a_geometric_start_is_near_the_distance_to_a_sphere_of_half_the_bound)
 {
     static const int activations[2] = {DIST_ACTIVATION_RELU, DIST_ACTIVATION_SOFTPLUS};
     static const float bounds[2] = {1.0f, 2.0f};
-    for (int k = 0; k < 4; k++) {
+    for (int k = 0; k < 8; k++) { /* the last four with Fourier levels, which have no share in it */
         enum { N = 200 };
         dist_context *ctx = test_context();
         dist_net_desc d = small_desc();
         float points[3 * N], sdf[N], code[5] = {1, -1, 0.5f, 2, 0};
         double mean = 0.0, worst = 0.0;
         d.width = 256;
-        d.activation = activations[k / 2];
+        d.activation = activations[k / 2 % 2];
+        d.levels = k < 4 ? 0 : 6;
         d.bound = bounds[k % 2];
         d.geometric = d.output_linear = 1;
         dist_net *net = dist_net_create(ctx, &d);
@@ -730,8 +731,8 @@ TEST(a_geometric_start_is_near_the_distance_to_a_sphere_of_half_the_bound)
             mean += error / N;
             worst = fmax(worst, error);
         }
-        CHECK_NEAR(0.0, mean, 0.15);
-        CHECK_NEAR(0.0, worst, 0.4);
+        CHECK_NEAR(0.0, mean, k < 4 ? 0.15 : 0.2);
+        CHECK_NEAR(0.0, worst, k < 4 ? 0.4 : 0.5);
         CHECK_NEAR(d.bound, field.radius, 0.0);
         dist_shape_destroy(shape);
         dist_net_destroy(net);

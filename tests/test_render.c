@@ -404,6 +404,57 @@ TEST(silhouette_of_a_box_is_the_smallest_f_along_its_edges)
     dist_context_destroy(ctx);
 }
 
+/* Beside thin rods each ray comes near several: the least |f| is that of the rod that the pixels around it see. From
+   one pixel to the next it changes by no more than they are apart, so nothing near the outline may stand far off. */
+TEST(silhouette_beside_rods_is_that_of_the_nearest_rod)
+{
+    enum { MOST = 256 };
+    static float silhouette[MOST * MOST];
+    static unsigned char mask[MOST * MOST];
+    dist_context *ctx = shape_context();
+    test_shape shape = shape_make(SHAPE_RODS, 0.02, 0, 0, 0);
+    dist_field field = shape_field(&shape, 1, 1);
+    const float eye[3] = {1.4f, 1, 2}, at[3] = {0, 0, 0};
+    for (int size = 64; size <= (test_quick() ? 128 : MOST); size *= 2) {
+        dist_camera camera = dist_camera_look_at(size, size, 0.7f, eye, at, NULL);
+        dist_images out;
+        int misses = 0, off = 0, far_off = 0;
+        double worst = 0;
+        memset(&out, 0, sizeof out);
+        out.silhouette = silhouette;
+        out.mask = mask;
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, NULL), ctx);
+        for (int i = 0; i < size * size; i++) {
+            float o[3], d[3];
+            double from[3], along[3], least = 1, middle = 0;
+            if (mask[i]) continue;
+            dist_camera_ray(&camera, (float)(i % size), (float)(i / size), o, d);
+            for (int j = 0; j < 3; j++) from[j] = (double)o[j], along[j] = (double)d[j];
+            for (int j = 0; j < 200; j++) {
+                double t = 1.6 + 2 * j / 200.0, f = shape_along(&shape, from, along, t);
+                if (f < least) least = f, middle = t;
+            }
+            for (double h = 0.005; h > 1e-6; h *= 0.5)
+                for (int side = -1; side <= 1; side += 2)
+                    while (shape_along(&shape, from, along, middle + side * h) < least) {
+                        middle += side * h;
+                        least = shape_along(&shape, from, along, middle);
+                    }
+            if (!(least > 0 && least < 0.03)) continue;
+            double error = fabs(least - (double)silhouette[i]);
+            misses++;
+            off += error > 2e-3;
+            far_off += error > 1e-2;
+            worst = fmax(worst, error);
+        }
+        int good = CHECK(misses > 300) & CHECK(off * 300 <= misses) & CHECK(far_off * 1000 <= misses);
+        if (!good || test_state.verbose)
+            printf("    %d: of %d misses %d off by more than 2e-3, %d by 1e-2, worst %.1e\n", size, misses, off,
+                   far_off, worst);
+    }
+    dist_context_destroy(ctx);
+}
+
 static void clamped_ball(void *user, int worker, size_t n, const float *p, float *sdf, float *gradient)
 {
     (void)user, (void)worker;
@@ -1557,6 +1608,7 @@ int main(int argc, char **argv)
     RUN(silhouette_near_the_outline_is_the_smallest_f_on_98_of_100);
     RUN(silhouette_of_misses_is_the_smallest_f_on_92_of_100);
     RUN(silhouette_of_a_box_is_the_smallest_f_along_its_edges);
+    RUN(silhouette_beside_rods_is_that_of_the_nearest_rod);
     RUN(silhouette_of_a_clamped_field_is_seen_from_the_plateau);
     RUN(silhouette_off_the_sphere_is_the_distance_to_it);
     RUN(a_smaller_picture_asks_for_less);

@@ -737,6 +737,76 @@ TEST(eikonal_of_points_that_are_not_finite_is_left_out_and_nonsense_refused)
     dist_context_destroy(ctx);
 }
 
+/* One bad point among others, or one bad seed, takes nothing from what the others say of code and weights. */
+TEST(points_that_are_not_finite_take_nothing_from_the_others)
+{
+    enum { N = 60, BAD = 31 };
+    static const model_desc nets[] = {
+        {.name = "relu", .code_size = 3},
+        {.name = "normed elu", .code_size = 3, .activation = DIST_ACTIVATION_ELU, .normed = 1},
+        {.name = "softplus", .code_size = 3, .activation = DIST_ACTIVATION_SOFTPLUS, .scale = 5, .first_scale = 5}};
+    static float points[3 * N], seeds[N], weights[2][20000];
+    float torus[5] = {0.1f, 0, 0, 0.5f, 0.2f}, code[3] = {0.3f, -0.2f, 0.1f};
+    const float bad[3] = {(float)NAN, (float)INFINITY, 0};
+    for (int k = 0; k < 4; k++) {
+        dist_context *ctx = test_context();
+        model m;
+        dist_net *net = NULL;
+        dist_shape *shape = NULL;
+        dist_field field = dist_field_torus(torus);
+        if (k < 3) {
+            m = model_make(&nets[k], 5);
+            net = model_load(ctx, &m);
+            shape = dist_shape_create(ctx, net, code);
+            field = dist_shape_field(shape);
+            REQUIRE(field.weight_count <= 20000);
+        }
+        for (int with = 0; with < 2 * 3 * 2; with++) { /* weights, too; NaN, infinity, a seed; backward, eikonal */
+            float grads_code[2][5] = {{0}}, loss[2] = {0, 0};
+            int heavy = with & 1, kind = with / 2 % 3, eikonal = with / 6;
+            test_random random = test_random_seed(3);
+            if ((heavy && k == 3) || (eikonal && kind == 2)) continue;
+            memset(weights, 0, sizeof weights);
+            for (int spoiled = 0; spoiled < 2; spoiled++) {
+                dist_gradients grads;
+                size_t n = spoiled ? N : N - 1; /* the other one goes without */
+                random = test_random_seed(3);
+                test_random_fill(&random, 3 * N, points, -0.8f, 0.8f);
+                test_random_fill(&random, N, seeds, -1, 1);
+                if (spoiled && kind < 2) points[3 * BAD + 1] = bad[kind];
+                if (spoiled && kind == 2) seeds[BAD] = bad[0];
+                for (int i = BAD; !spoiled && i + 1 < N; i++) {
+                    memcpy(points + 3 * i, points + 3 * i + 3, 3 * sizeof(float));
+                    seeds[i] = seeds[i + 1];
+                }
+                memset(&grads, 0, sizeof grads);
+                grads.code = grads_code[spoiled];
+                if (heavy) grads.weights = weights[spoiled];
+                float mean = (float)n / (float)N; /* of what the eikonal term is a mean over */
+                if (eikonal)
+                    CHECK_STATUS(DIST_OK, dist_field_eikonal(ctx, &field, n, points, mean, &loss[spoiled], &grads),
+                                 ctx);
+                else
+                    CHECK_STATUS(DIST_OK, dist_field_backward(ctx, &field, n, points, seeds, NULL, NULL, NULL, &grads),
+                                 ctx);
+            }
+            double largest = 0;
+            for (int j = 0; j < field.code_size; j++) largest = fmax(largest, fabs((double)grads_code[0][j]));
+            CHECK(eikonal || largest > 1e-3);
+            for (int j = 0; j < field.code_size; j++)
+                MODEL_CHECK(fabs((double)grads_code[0][j] - (double)grads_code[1][j]) <= 1e-4 * largest + 1e-6,
+                            k < 3 ? nets[k].name : "torus", eikonal ? "eikonal" : "backward", with, j);
+            CHECK_NEAR(loss[0], loss[1], 1e-4 * (1 + (double)loss[0]));
+            for (size_t j = 0; heavy && j < field.weight_count; j++)
+                CHECK_NEAR(weights[0][j], weights[1][j], 1e-3 * (1 + fabs((double)weights[0][j])));
+        }
+        dist_shape_destroy(shape);
+        dist_net_destroy(net);
+        if (k < 3) model_free(&m);
+        dist_context_destroy(ctx);
+    }
+}
+
 int main(int argc, char **argv)
 {
     test_begin(argc, argv);
@@ -750,5 +820,6 @@ int main(int argc, char **argv)
     RUN(training_with_the_eikonal_term_makes_a_sine_net_a_distance);
     RUN(eikonal_gradients_have_the_same_bits_for_every_number_of_workers);
     RUN(eikonal_of_points_that_are_not_finite_is_left_out_and_nonsense_refused);
+    RUN(points_that_are_not_finite_take_nothing_from_the_others);
     return test_report();
 }

@@ -979,6 +979,83 @@ TEST(a_camera_inside_the_solid_gets_what_the_desc_says)
     dist_context_destroy(ctx);
 }
 
+/* The paper's tracer goes back out of a solid, behind the camera: that ray started inside, however it was steered. */
+#ifndef DIST_NO_PAPER
+TEST(the_papers_tracer_knows_a_camera_in_the_solid)
+{
+    enum { W = 24 };
+    float ball[4] = {0, 0, 0, 0.9f}, eye[3] = {0.05f, 0.02f, -0.05f}, at[3] = {0.1f, 0.1f, 0}, distance[W * W];
+    unsigned char mask[W * W], status[W * W];
+    dist_context *ctx = shape_context();
+    dist_field field = dist_field_sphere(ball);
+    dist_camera camera = dist_camera_look_at(W, W, 0.7f, eye, at, NULL);
+    field.radius = 1;
+    for (int k = 0; k < 4 * 3 * 2; k++) {
+        dist_render_desc how;
+        dist_images out;
+        int other = 0, masked = 0, behind = 0;
+        memset(&how, 0, sizeof how);
+        memset(&out, 0, sizeof out);
+        how.trace = DIST_TRACE_PAPER;
+        how.paper_row = k % 4;
+        how.step_scale = k / 4 % 3 == 1 ? 2.5f : 0.0f;
+        how.max_steps = k / 4 % 3 == 2 ? 4 : 0;
+        how.inside = k / 12 ? DIST_INSIDE_HIT : DIST_INSIDE_BACKGROUND;
+        out.distance = distance;
+        out.mask = mask;
+        out.status = status;
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+        for (int i = 0; i < W * W; i++) {
+            other += status[i] != DIST_RAY_INSIDE;
+            masked += mask[i];
+            behind += distance[i] < -1e-6f;
+        }
+        CHECK_EQUAL(0, other);
+        CHECK_EQUAL(0, behind);
+        CHECK_EQUAL(k / 12 ? W * W : 0, masked);
+    }
+    dist_context_destroy(ctx);
+}
+#endif
+
+/* Where f is a tenth of the distance, exactly as declared, steps that nothing proves must be as short as elsewhere. */
+TEST(a_field_of_small_slope_hides_nothing)
+{
+    enum { N = 3000 };
+    static float origins[3 * N], directions[3 * N];
+    static dist_hit hits[N];
+    dist_context *ctx = shape_context();
+    for (int k = 0; k < 4; k++) {
+        test_shape shape = shape_make(k & 1 ? SHAPE_TORUS : SHAPE_RODS, k & 1 ? 0.5 : 0.15, 0.2, 0, 0);
+        test_random random = test_random_seed(21 + (unsigned)k);
+        int missed = 0, crossing = 0;
+        shape.slope = 0.1;
+        dist_field field = shape_field(&shape, 1.3, k < 2 ? 0.1 : 0.15);
+        for (int round = 0; round < 3; round++) {
+            make_rays(&random, &shape, N, origins, directions);
+            CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, N, origins, directions, NULL, hits, NULL), ctx);
+            for (int i = 0; i < N; i++) {
+                double o[3], d[3], size = 0, deepest = 1;
+                for (int j = 0; j < 3; j++) {
+                    o[j] = (double)origins[3 * i + j];
+                    d[j] = (double)directions[3 * i + j];
+                    size += d[j] * d[j];
+                }
+                for (int j = 0; j < 3; j++) d[j] /= sqrt(size);
+                for (double t = 0; t < 4 && deepest >= -0.01; t += 0.02)
+                    deepest = fmin(deepest, shape_along(&shape, o, d, t));
+                if (!(deepest < -0.01)) continue;
+                crossing++;
+                missed += hits[i].status == DIST_RAY_MISS;
+            }
+        }
+        CHECK(crossing > 1000);
+        CHECK_EQUAL(0, missed);
+        if (test_state.verbose) printf("    slope %g: %d of %d missed\n", shape.slope, missed, crossing);
+    }
+    dist_context_destroy(ctx);
+}
+
 /* 9 */
 TEST(a_ray_that_starts_on_the_surface_leaves_it)
 {
@@ -2165,6 +2242,10 @@ int main(int argc, char **argv)
     RUN(constant_fields_end_within_the_budget_with_the_right_status);
     RUN(a_camera_inside_the_sphere_starts_at_itself_and_ends_at_the_exit);
     RUN(a_camera_inside_the_solid_gets_what_the_desc_says);
+#ifndef DIST_NO_PAPER
+    RUN(the_papers_tracer_knows_a_camera_in_the_solid);
+#endif
+    RUN(a_field_of_small_slope_hides_nothing);
     RUN(a_ray_that_starts_on_the_surface_leaves_it);
     RUN(the_bounding_sphere_itself_is_no_obstacle);
     RUN(far_origins_hit_what_double_hits);

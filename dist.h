@@ -685,7 +685,9 @@ typedef struct dist_tape dist_tape;
    miss), after 128 (64) if f at the picture's hits changes by more than 0.0004 of the radius a render, on average. What
    such a ray finds is followed to its neighbors, within a tile at once where it is nearer by a hundredth of the radius,
    else pixel by pixel. Without a silhouette a miss that the surface nearly touches is looked at on both sides of that
-   place every second render, where f has hardly changed there every eighth: an outline may be so late. */
+   place every second render, where f has hardly changed there every eighth: an outline may be so late. With one a pixel
+   beside the outline may keep another least |f| than a cold render finds, off by less than a pixel's width, and for some
+   hundred renders after all stands still. */
 DIST_API dist_tape *dist_tape_create(dist_context *ctx, const dist_camera *camera, const dist_render_desc *desc);
 DIST_API void dist_tape_destroy(dist_tape *tape);
 
@@ -10155,8 +10157,7 @@ static int disti_ray_band(const disti_tracer *tracer, disti_ray *ray, float f)
 /* The field is negative where the ray starts. */
 static int disti_ray_inside(const disti_tracer *tracer, disti_ray *ray, float f)
 {
-    if (tracer->how.inside == DIST_INSIDE_HIT) return disti_ray_end(ray, DIST_RAY_INSIDE, ray->enter, 0.0f, 0.0f);
-    if (tracer->how.inside == DIST_INSIDE_BACKGROUND) return disti_ray_end(ray, DIST_RAY_INSIDE, ray->enter, f, 0.0f);
+    if (tracer->how.inside != DIST_INSIDE_EXIT) return disti_ray_end(ray, DIST_RAY_INSIDE, ray->enter, f, 0.0f);
     ray->sign = -ray->sign;
     ray->s = ray->enter;
     ray->f = -f;
@@ -13262,8 +13263,8 @@ static double disti_ray_nearest(const dist_field *field, const disti_ray *ray, d
     return sqrt(disti_dot(away, away));
 }
 
-/* Value of the soft silhouette of a finished ray: signed f at a hit, |f| at a miss, less epsilon; off the sphere the
-   ray's distance to it. The sign says hit or miss whatever rounding did. */
+/* Value of the soft silhouette of a finished ray: |f|, of the paper's hits and of hits inside signed, less epsilon; off
+   the sphere the ray's distance to it. The sign says hit or miss whatever rounding did. */
 static float disti_ray_silhouette(const disti_tracer *tracer, const disti_ray *ray)
 {
     const dist_field *field = tracer->field;
@@ -13276,8 +13277,8 @@ static float disti_ray_silhouette(const disti_tracer *tracer, const disti_ray *r
     float f = ray->fbest, magnitude = f < 0.0f ? -f : f;
     float epsilon = disti_ray_epsilon(tracer, ray, ray->best);
     if (ray->status == DIST_RAY_NOT_FINITE) return epsilon;
-    if (disti_ray_is_hit(tracer, ray))
-        return DISTI_MIN((tracer->how.trace == DIST_TRACE_PAPER ? f : magnitude) - epsilon, -tiny);
+    int is_signed = tracer->how.trace == DIST_TRACE_PAPER || ray->status == DIST_RAY_INSIDE;
+    if (disti_ray_is_hit(tracer, ray)) return DISTI_MIN((is_signed ? f : magnitude) - epsilon, -tiny);
     if (magnitude > 2e38f) /* no sample: no more is known than this bound */
         return (float)DISTI_MIN((double)tracer->lipschitz * (double)field->radius, 3e38);
     return DISTI_MAX(magnitude - epsilon, tiny);

@@ -1074,6 +1074,8 @@ TEST(inside_modes_are_what_the_desc_says)
             CHECK_EQUAL(mode == DIST_INSIDE_EXIT ? DIST_RAY_HIT : DIST_RAY_INSIDE, a.status[i]);
             CHECK_EQUAL(mode != DIST_INSIDE_BACKGROUND, a.mask[i]);
             CHECK((a.silhouette[i] < 0) == a.mask[i]);
+            double start = shape_value(&shape, o); /* what its gradient is that of */
+            if (mode == DIST_INSIDE_HIT) CHECK_NEAR(start, (double)a.silhouette[i], 1e-4);
             double expected = mode == DIST_INSIDE_BACKGROUND ? 9 : mode == DIST_INSIDE_HIT ? 0 : exit;
             CHECK_NEAR(expected, a.distance[i], (double)a.error[i] + 1e-6);
         }

@@ -685,9 +685,9 @@ typedef struct dist_tape dist_tape;
    miss), after 128 (64) if f at the picture's hits changes by more than 0.0004 of the radius a render, on average. What
    such a ray finds is followed to its neighbors, within a tile at once where it is nearer by a hundredth of the radius,
    else pixel by pixel. Without a silhouette a miss that the surface nearly touches is looked at on both sides of that
-   place every second render, where f has hardly changed there every eighth: an outline may be so late. With one a pixel
-   beside the outline may keep another least |f| than a cold render finds, off by less than a pixel's width, and for some
-   hundred renders after all stands still. */
+   place every second render, where f has hardly changed there every eighth: an outline may be so late. With one a
+   pixel beside the outline may keep another least |f| than a cold render finds, off by less than a pixel's width, and
+   for some hundred renders after all stands still. */
 DIST_API dist_tape *dist_tape_create(dist_context *ctx, const dist_camera *camera, const dist_render_desc *desc);
 DIST_API void dist_tape_destroy(dist_tape *tape);
 

@@ -4438,7 +4438,7 @@ static void disti_backward_seed(void *user, size_t first, size_t count, const fl
     if (job->seed_fn && job->d_sdf) memcpy(job->d_sdf + at, d_sdf, count * sizeof(float));
     if (!job->d_points || !gradient) return;
     for (float *d = job->d_points + 3 * at; count > 0; count--, d += 3, gradient += 3, d_sdf++) {
-        if (!disti_finite(*d_sdf)) continue;
+        if (!disti_finite(*d_sdf) || !disti_finite_all(3, gradient)) continue;
         d[0] += *d_sdf * gradient[0];
         d[1] += *d_sdf * gradient[1];
         d[2] += *d_sdf * gradient[2];
@@ -12523,13 +12523,12 @@ static int disti_minima_beside_hit(const disti_minima *m, int index)
 }
 
 /* Rays also look where their neighbors' least samples are. */
-static void disti_minima_look(const disti_minima *m, float limit)
+static void disti_minima_look(const disti_minima *m)
 {
     size_t count = 0;
     for (size_t i = 0; i < m->close_count; i++) {
         disti_ray *ray = &m->bench->rays[m->close[i]];
         const disti_ray *best = ray, *other[4];
-        if (ray->fbest > limit) continue;
         disti_rays_beside(m, m->close[i], other);
         for (int k = 0; k < 4; k++)
             if (other[k] && disti_has_minimum(other[k]) && other[k]->fbest < best->fbest) best = other[k];
@@ -12734,11 +12733,13 @@ static void disti_silhouette(const disti_tracer *tracer, int worker, const disti
     disti_minima_nodes(m);
     size_t all = m->close_count;
     m->close_count = 0;
-    for (size_t i = 0; i < all; i++)
-        if (!(bench->rays[m->close[i]].fbest > m->far)) m->close[m->close_count++] = m->close[i];
-        else if (disti_minima_beside_hit(m, m->close[i]))
-            m->front_count = disti_minima_push(m, m->fronts[0], m->front_count, m->close[i]);
-    disti_minima_look(m, m->far);
+    for (size_t i = 0; i < all; i++) {
+        int index = m->close[i];
+        if (!(bench->rays[index].fbest > m->far)) m->close[m->close_count++] = index;
+        else if (disti_minima_beside_hit(m, index))
+            m->front_count = disti_minima_push(m, m->fronts[0], m->front_count, index);
+    }
+    disti_minima_look(m);
     disti_minima_outline(m);
     disti_minima_spread(m);
     disti_minima_sweep(m);

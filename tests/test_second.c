@@ -745,7 +745,7 @@ TEST(points_that_are_not_finite_take_nothing_from_the_others)
         {.name = "relu", .code_size = 3},
         {.name = "normed elu", .code_size = 3, .activation = DIST_ACTIVATION_ELU, .normed = 1},
         {.name = "softplus", .code_size = 3, .activation = DIST_ACTIVATION_SOFTPLUS, .scale = 5, .first_scale = 5}};
-    static float points[3 * N], seeds[N], weights[2][20000];
+    static float points[3 * N], seeds[N], d_points[3 * N], weights[2][20000];
     float torus[5] = {0.1f, 0, 0, 0.5f, 0.2f}, code[3] = {0.3f, -0.2f, 0.1f};
     const float bad[3] = {(float)NAN, (float)INFINITY, 0};
     for (int k = 0; k < 4; k++) {
@@ -780,6 +780,7 @@ TEST(points_that_are_not_finite_take_nothing_from_the_others)
                     seeds[i] = seeds[i + 1];
                 }
                 memset(&grads, 0, sizeof grads);
+                memset(d_points, 0, sizeof d_points);
                 grads.code = grads_code[spoiled];
                 if (heavy) grads.weights = weights[spoiled];
                 float mean = (float)n / (float)N; /* of what the eikonal term is a mean over */
@@ -787,8 +788,9 @@ TEST(points_that_are_not_finite_take_nothing_from_the_others)
                     CHECK_STATUS(DIST_OK, dist_field_eikonal(ctx, &field, n, points, mean, &loss[spoiled], &grads),
                                  ctx);
                 else
-                    CHECK_STATUS(DIST_OK, dist_field_backward(ctx, &field, n, points, seeds, NULL, NULL, NULL, &grads),
-                                 ctx);
+                    CHECK_STATUS(DIST_OK, dist_field_backward(ctx, &field, n, points, seeds, NULL, NULL, d_points,
+                                                              &grads), ctx);
+                for (size_t j = 0; j < 3 * n; j++) CHECK(disti_finite(d_points[j]));
             }
             double largest = 0;
             for (int j = 0; j < field.code_size; j++) largest = fmax(largest, fabs((double)grads_code[0][j]));

@@ -481,10 +481,10 @@ TEST(color_backward_of_pictures_matches_differences)
     }
 }
 
-/* DIST_GRADIENT_NORMAL weights what depth pulls on, nothing of what colors do. */
+/* DIST_GRADIENT_NORMAL weights what depth pulls on, nothing of what colors and normals do. */
 TEST(color_backward_is_the_same_where_depth_is_weighted_by_the_normal)
 {
-    static float g[2][MOST];
+    static float g[2][MOST], normal[3 * PIXELS], d_normal[3 * PIXELS];
     static pictures a;
     static image_job job;
     scene s;
@@ -496,6 +496,9 @@ TEST(color_backward_is_the_same_where_depth_is_weighted_by_the_normal)
         how.gradient = weighted ? DIST_GRADIENT_NORMAL : DIST_GRADIENT_IMPLICIT;
         dist_tape_destroy(pictures_take(&a, &s));
         pixels_choose(&s, &a, &job);
+        a.out.normal = normal;
+        a.d_out.normal = d_normal;
+        for (int i = 0; i < 3 * PIXELS; i++) d_normal[i] = 0.01f * (float)(i % 7 - 3);
         dist_tape *tape = dist_tape_create(s.ctx, &s.camera, &how);
         CHECK_STATUS(DIST_OK, dist_render(s.ctx, &s.field, &s.camera, &how, &a.out, tape), s.ctx);
         dist_gradients grads = gradients_of(&s, g[weighted]);

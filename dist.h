@@ -1035,8 +1035,21 @@ DISTI_UNUSED static float disti_nan(void)
     return x;
 }
 
+/* Of many: a carry out of the exponent's bits says that one is all ones. */
+DISTI_UNUSED DISTI_LOOPS static int disti_finite_many(size_t n, const float *x)
+{
+    uint32_t carry = 0;
+    for (size_t i = 0; i < n; i++) {
+        uint32_t bits;
+        memcpy(&bits, x + i, sizeof bits);
+        carry |= (bits & 0x7f800000u) + 0x00800000u;
+    }
+    return !(carry >> 31);
+}
+
 DISTI_UNUSED static int disti_finite_all(size_t n, const float *x)
 {
+    if (n > 16) return disti_finite_many(n, x);
     for (size_t i = 0; i < n; i++)
         if (!disti_finite(x[i])) return 0;
     return 1;
@@ -4437,8 +4450,9 @@ static void disti_backward_seed(void *user, size_t first, size_t count, const fl
     else memcpy(d_sdf, job->d_sdf + at, count * sizeof(float));
     if (job->seed_fn && job->d_sdf) memcpy(job->d_sdf + at, d_sdf, count * sizeof(float));
     if (!job->d_points || !gradient) return;
+    int all = disti_finite_all(count, d_sdf) && disti_finite_all(3 * count, gradient);
     for (float *d = job->d_points + 3 * at; count > 0; count--, d += 3, gradient += 3, d_sdf++) {
-        if (!disti_finite(*d_sdf) || !disti_finite_all(3, gradient)) continue;
+        if (!all && (!disti_finite(*d_sdf) || !disti_finite_all(3, gradient))) continue;
         d[0] += *d_sdf * gradient[0];
         d[1] += *d_sdf * gradient[1];
         d[2] += *d_sdf * gradient[2];

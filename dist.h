@@ -496,7 +496,8 @@ DIST_API void dist_camera_ray(const dist_camera *camera, float x, float y, float
 enum { DIST_TRACE_GUARDED = 0, DIST_TRACE_PAPER = 1 };
 enum { DIST_PAPER_COARSE_TO_FINE = 0, DIST_PAPER_AGGRESSIVE, DIST_PAPER_DYNAMIC, DIST_PAPER_PARALLEL };
 /* Of depth: IMPLICIT: -df / (grad f . v), exact at the hit. NORMAL: that times |n . v|, so that grazing pixels do not
-   dominate. PAPER: alpha times the sum of df over the K = how.samples samples of smallest |f|: it grows with K. */
+   dominate. PAPER: alpha times the sum of df over the K = how.samples samples of smallest |f|, but for those beyond .1
+   of the bounding radius; with the guarded tracer all K are the hit, so that it grows with K. */
 enum { DIST_GRADIENT_AUTO = 0, DIST_GRADIENT_IMPLICIT, DIST_GRADIENT_NORMAL, DIST_GRADIENT_PAPER };
 enum { DIST_NORMAL_ANALYTIC = 0, DIST_NORMAL_DIFFERENCE = 1 };
 enum { DIST_SPACE_CAMERA = 0, DIST_SPACE_WORLD = 1 };
@@ -573,7 +574,7 @@ typedef struct dist_stats {
     unsigned long long unresolved, inside, plateau, not_finite;
     unsigned long long capped;          /* backward: rays whose grad f . v was capped, or grad f 0: then without pull */
     unsigned long long backward_points; /* backward: points through the adjoint */
-    unsigned long long skipped;         /* backward: pixels with a zero upstream gradient */
+    unsigned long long skipped;         /* backward: pixels with no upstream gradient at a hit or of the silhouette */
     double operations; /* multiply-adds a dense net would have done for the queries; 0 if the field is not a net */
     double operations_done;             /* of them, those not left out as dead units */
     float epsilon;                      /* the |f| in force, smallest over the picture */
@@ -14760,7 +14761,8 @@ typedef struct disti_render_backward_job {
     int camera, geometry; /* a gradient of the camera, one that depends on where the hit is at all, is wanted */
 } disti_render_backward_job;
 
-/* Seeds once grad f is known: d_sdf = entry's own, and the implicit rule's. */
+/* Seeds once grad f is known: d_sdf = entry's own, and the implicit rule's, or the paper's where all K samples are the
+   hit: there a ray that leaves the solid stops farther away as f falls. */
 static void disti_render_seed(void *user, size_t first, size_t count, const float *sdf, const float *gradient,
                               float *d_sdf)
 {
@@ -14775,6 +14777,12 @@ static void disti_render_seed(void *user, size_t first, size_t count, const floa
         d_sdf[i] = entry->capped ? 0.0f : entry->d_sdf;
         entry->weight = 1.0f;
         if (entry->d_distance == 0.0f && entry->d_motion == 0.0f && !entry->capped) continue;
+        if (mode == DIST_GRADIENT_PAPER && !entry->capped) { /* no way out but where it was asked for */
+            const dist_render_desc *how = &tape->tracer.how;
+            int out = how->inside == DIST_INSIDE_EXIT && g[0] * v[0] + g[1] * v[1] + g[2] * v[2] > 0.0f;
+            d_sdf[i] += (out ? -1.0f : 1.0f) * how->step_scale * (float)how->samples * entry->d_distance;
+            continue;
+        }
         if (entry->capped || !(length > 1e-30f)) {
             entry->capped = 1;
             entry->weight = 0.0f;
@@ -14967,10 +14975,6 @@ static void disti_backward_pixel(disti_render_backward_job *job, size_t pixel, f
         if (!paper && (d_distance != 0.0f || d_motion != 0.0f))
             disti_backward_add(job, &ray, p, d_distance, d_motion, d_depth, 0.0f);
         return;
-    }
-    if (paper) { /* all K samples are the hit */
-        d_silhouette += tracer->how.step_scale * (float)tracer->how.samples * d_distance;
-        d_distance = 0.0f;
     }
     if (d_distance != 0.0f || d_motion != 0.0f || d_silhouette != 0.0f)
         disti_backward_add(job, &ray, p, d_distance, d_motion, d_depth, d_silhouette);

@@ -1188,6 +1188,43 @@ TEST(auto_mode_is_the_mode_that_resolve_names)
     scene_close(&s);
 }
 
+/* From within a sphere: its way out moves by dr, and the paper's rule says alpha K of that. */
+TEST(paper_mode_at_the_way_out_of_a_solid_goes_the_other_way)
+{
+    enum { SIDE = 16 };
+    static const float eye[3] = {0.05f, -0.02f, 0.1f}, at[3] = {1, 0.2f, 0.3f}, up[3] = {0, 1, 0};
+    static float distance[SIDE * SIDE], w[SIDE * SIDE];
+    float sphere[4] = {0, 0, 0, 0.5f}, code[4] = {0};
+    dist_context *ctx = dist_context_create(NULL);
+    dist_field field = dist_field_sphere(sphere);
+    dist_camera camera = dist_camera_look_at(SIDE, SIDE, 0.8f, eye, at, up);
+    dist_images out, d_out;
+    dist_render_desc how;
+    dist_gradients grads;
+    memset(&out, 0, sizeof out);
+    memset(&d_out, 0, sizeof d_out);
+    memset(&how, 0, sizeof how);
+    memset(&grads, 0, sizeof grads);
+    field.radius = 1.0f;
+    out.distance = distance;
+    d_out.distance = w;
+    grads.code = code;
+    how.inside = DIST_INSIDE_EXIT;
+    how.gradient = DIST_GRADIENT_PAPER;
+    how.samples = 3;
+    how.step_scale = 1.25f;
+    dist_tape *tape = dist_tape_create(ctx, &camera, &how);
+    CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, tape), ctx);
+    for (int i = 0; i < SIDE * SIDE; i++) {
+        CHECK(distance[i] > 0.3f && distance[i] < 0.7f);
+        w[i] = 1.0f;
+    }
+    CHECK_STATUS(DIST_OK, dist_render_backward(ctx, tape, &d_out, &grads), ctx);
+    CHECK_NEAR(1.25 * 3.0 * SIDE * SIDE, (double)code[3], 1e-2); /* df / dr = -1 */
+    dist_tape_destroy(tape);
+    dist_context_destroy(ctx);
+}
+
 TEST(paper_mode_after_the_guarded_tracer_is_alpha_k_df_at_the_hit)
 {
     for (int k = 0; k < 3; k++) {
@@ -2092,6 +2129,7 @@ int main(int argc, char **argv)
     RUN(normal_mode_is_implicit_mode_weighted_by_the_cosine);
     RUN(auto_mode_is_the_mode_that_resolve_names);
     RUN(paper_mode_after_the_guarded_tracer_is_alpha_k_df_at_the_hit);
+    RUN(paper_mode_at_the_way_out_of_a_solid_goes_the_other_way);
 #ifndef DIST_NO_PAPER
     RUN(paper_mode_after_the_papers_tracer_is_alpha_df_summed_over_the_samples);
 #endif

@@ -424,7 +424,7 @@ typedef struct dist_net_desc {
     int levels;       /* Fourier levels beside the point: sin and cos of pi 2^k p, k below levels; at most 16 */
     int color;        /* 1: a texture: r, g, b in place of the distance, with a sigmoid at the end unless linear */
     int geometric;    /* 1: starts near the distance to a sphere of half the bound (ReLU; softplus where scale * bound
-                         is some 30 or more), Fourier levels without a share in it; 0: PyTorch's start */
+                         is some 200 or more), Fourier levels without a share in it; 0: PyTorch's start */
     float bound;      /* radius of the sphere that holds the shape, 1e-6 to 1e6; 0: 1 */
     float clamp;      /* 0: 0.1 with a code, none without */
     unsigned seed;
@@ -756,12 +756,14 @@ typedef struct dist_photometric_desc {
 /* Photo `from` warped into view `to` through the depth of `to` and compared with what `to` saw:
        p = unproject_to(x, depth), x' = project_from(p),
        (1 - ssim) mean |I_to(x) - I_from(x')| + ssim mean (1 - SSIM)/2,      bilinear I_from; SSIM over 3 x 3 pixels
-   over the channels and the pixels that hit, lie in front of `from` and inside its picture, and are not hidden there:
+   over the channels and the pixels that hit, 0 < depth < 1e5 as of a target, lie more than 1e-9 in front of `from` and
+   inside its picture, and are not hidden there:
    (z of p in `from` - its depth at x')^2 < visibility; from->depth may be NULL: nothing is hidden. Windows of SSIM
    count where all nine pixels do. Adds dL/ddepth of `to` to d_depth (h, w) and, each unless NULL, dL/d(rotation,
    translation) of `to` and then of `from` to d_cameras (12), at this depth: what the depth itself does as the camera
    moves is dist_render_backward's to add. What is visible is held constant.
-   desc may be NULL. A camera that dist_render refuses, or an ssim out of range: 0 and no gradient. */
+   desc may be NULL. A camera that dist_render refuses, an ssim out of range, or a NaN: 0 and no
+   gradient. */
 DIST_API float dist_loss_photometric(const dist_photo *to, const dist_photo *from, const dist_photometric_desc *desc,
                                      float weight, float *d_depth, float d_cameras[12]);
 
@@ -777,8 +779,8 @@ typedef struct dist_adam {
     float epsilon; /* 0: 1e-8 */
     int step;      /* steps taken so far */
 } dist_adam;
-/* x (n) moves against gradient (n). A gradient that is not finite leaves its number and moments as they were;
-   returns how many did: n, all of them, where x, gradient or adam->moments is NULL or the rate is not finite. */
+/* x (n) moves against gradient (n). A gradient or moment that is not finite leaves its number and moments as they
+   were; returns how many did: n, all of them, where x, gradient or adam->moments is NULL or the rate is not finite. */
 DIST_API size_t dist_adam_step(dist_adam *adam, size_t n, float *x, const float *gradient);
 #endif
 
@@ -15314,7 +15316,7 @@ DIST_API float dist_loss_normal(size_t n, const float *normal, const float *targ
         if (!(inverse > 0.0)) continue;
         for (size_t k = 3 * i; k < 3 * i + 3; k++) d_normal[k] -= (float)(scale * (double)target[k] * inverse);
     }
-    return (float)(scale * sum);
+    return disti_within_float(scale * sum);
 }
 
 /* forward   L = weight sum_k 1 / N_k sum_{i: S_gt = k} max(0, S_i) for k = 1, max(0, -S_i) for k = 0     (paper, eq. 8)
@@ -15578,7 +15580,9 @@ DIST_API float dist_loss_photometric(const dist_photo *to, const dist_photo *fro
     disti_photo_pair pair;
     double sum[4] = {0.0, 0.0, 0.0, 0.0}, again[4] = {0.0, 0.0, 0.0, 0.0}, scale[2], d_pose[12], turned[3];
     float ssim = desc ? desc->ssim : 0.0f, visibility = desc ? desc->visibility : 0.0f;
-    if (!to || !from || !to->color || !to->depth || !from->color || !(ssim >= 0.0f && ssim <= 1.0f)) return 0.0f;
+    if (!to || !from || !to->color || !to->depth || !from->color || !(ssim >= 0.0f && ssim <= 1.0f) ||
+        visibility != visibility)
+        return 0.0f;
     if (disti_camera_check(NULL, &to->camera, "") != DIST_OK || disti_camera_check(NULL, &from->camera, "") != DIST_OK)
         return 0.0f;
     if (!disti_finite(weight)) weight = 0.0f; /* what is seen is told all the same */
@@ -15626,7 +15630,7 @@ DIST_API size_t dist_adam_step(dist_adam *adam, size_t n, float *x, const float 
     float *second = adam->moments + n;
     for (size_t i = 0; i < n; i++) {
         double g = (double)gradient[i];
-        if (!disti_finite(gradient[i])) {
+        if (!disti_finite(gradient[i]) || !disti_finite(first[i]) || !disti_finite(second[i])) {
             skipped++;
             continue;
         }
@@ -16882,7 +16886,8 @@ static int disti_ply_property_line(disti_mesh_text *r, disti_ply *ply)
     const char *axes[3] = {"x", "y", "z"};
     for (int k = 0; !list && element->vertex && k < 3; k++)
         if (disti_ply_word(t, axes[k])) p->role = DISTI_PLY_X + k;
-    if (list && (disti_ply_word(t, "vertex_indices") || disti_ply_word(t, "vertex_index"))) p->role = DISTI_PLY_INDICES;
+    if (list && element->face && (disti_ply_word(t, "vertex_indices") || disti_ply_word(t, "vertex_index")))
+        p->role = DISTI_PLY_INDICES;
     element->last = ply->property_count;
     return 1;
 }
@@ -16896,6 +16901,8 @@ static int disti_ply_element_line(disti_mesh_text *r, disti_ply *ply)
     ply->element_count++;
     element->vertex = disti_ply_word(t, "vertex");
     element->face = disti_ply_word(t, "face");
+    if (disti_ply_word(t, "tristrips"))
+        return disti_mesh_fail(r, DIST_UNSUPPORTED, "strips of triangles (PLY tristrips); faces are read", 0);
     element->first = element->last = ply->property_count;
     disti_skip_blank(t);
     while (t->at < t->end && !element->vertex && !element->face && !disti_is_space(*t->at)) t->at++;

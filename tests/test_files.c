@@ -385,6 +385,9 @@ TEST(mesh_files_that_mean_harm_are_refused_with_a_sentence)
         "element face 1\nproperty list uchar int indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n",
         "OFF",
         "OFF\n",
+        "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+        "element tristrips 1\nproperty list int int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n1 1 0\n"
+        "4 0 1 2 3\n",
         "OFF BINARY\n",
         "OFF\n1 1 0\n0 0 0\n",
         "OFF\n3 1 0\n0 0 0\n0 0 0\n0 0 0\n3 0 1 3\n",

@@ -285,6 +285,8 @@ TEST(numbers_at_the_end_of_the_range_stay_in_it)
     adam.rate = 3e38f;
     CHECK_EQUAL(0, dist_adam_step(&adam, 1, x, g));
     CHECK(test_finite((double)x[0]) && x[0] < -3e38f);
+    float normal[3] = {1e30f, 0, 0}, target[3] = {1, 0, 0};
+    CHECK(test_finite((double)dist_loss_normal(1, normal, target, NULL, 1e30f, NULL)));
 }
 
 TEST(adam_skips_and_counts_gradients_that_are_not_finite)
@@ -301,6 +303,12 @@ TEST(adam_skips_and_counts_gradients_that_are_not_finite)
     CHECK(x[2] < 3);
     CHECK_NEAR(0.5, moments[0], 0);
     CHECK_NEAR(0.25, moments[4], 0);
+    for (int i = 0; i < 3; i++) x[i] = g[i] = 1.0f;
+    moments[0] = moments[4] = loss_bits(0x7fc00000u); /* a checkpoint that is not what it was */
+    CHECK_EQUAL(2, dist_adam_step(&adam, 3, x, g));
+    CHECK_NEAR(1, x[0], 0);
+    CHECK_NEAR(1, x[1], 0);
+    CHECK(x[2] < 1 && x[2] > 0);
 }
 
 TEST(adam_without_its_arrays_says_that_nothing_moved)

@@ -298,9 +298,9 @@ DIST_API dist_status dist_color_backward(dist_context *ctx, const dist_field *fi
                                          const float *d_color, float *d_points, const dist_gradients *grads);
 
 /* What makes f a distance: *loss = weight * mean over the n points of (|grad f| - 1)^2, and its gradient is added to
-   grads->code and ->weights. loss and grads may be NULL; what grads holds of camera and color must be. Points that are
-   not finite, or whose gradient is not, add nothing. Exact where the field has second_fn (a ReLU's kinks have no share,
-   as in automatic differentiation), else by differences over 1e-3 of the radius. */
+   grads->code and ->weights. loss and grads may be NULL; what grads holds of camera and color must be. An error leaves
+   *loss alone. Points that are not finite, or whose gradient is not, add nothing. Exact where the field has second_fn
+   (a ReLU's kinks have no share, as in automatic differentiation), else by differences over 1e-3 of the radius. */
 DIST_API dist_status dist_field_eikonal(dist_context *ctx, const dist_field *field, size_t n, const float *points,
                                         float weight, float *loss, const dist_gradients *grads);
 #endif
@@ -762,7 +762,7 @@ typedef struct dist_photometric_desc {
    count where all nine pixels do. Adds dL/ddepth of `to` to d_depth (h, w) and, each unless NULL, dL/d(rotation,
    translation) of `to` and then of `from` to d_cameras (12), at this depth: what the depth itself does as the camera
    moves is dist_render_backward's to add. What is visible is held constant.
-   desc may be NULL. A camera that dist_render refuses, an ssim out of range, or a NaN: 0 and no
+   desc may be NULL. A camera that dist_render refuses, an ssim out of range, a visibility that is not finite: 0 and no
    gradient. */
 DIST_API float dist_loss_photometric(const dist_photo *to, const dist_photo *from, const dist_photometric_desc *desc,
                                      float weight, float *d_depth, float d_cameras[12]);
@@ -4530,10 +4530,13 @@ static dist_status disti_field_second(dist_context *ctx, const dist_field *field
     for (size_t i = 0; i < count; i++) {
         const float *u = directions + i / stencil * 3, *p = points + i / stencil * 3;
         size_t axis = i % stencil / 2;
-        float length = disti_length(u[0], u[1], u[2]), h = i % 2 ? -delta : delta;
-        for (size_t k = 0; k < 3; k++)
-            moved[3 * i + k] = p[k] + (stencil == 6 ? k == axis ? h : 0.0f : length > 0.0f ? h / length * u[k] : 0.0f);
-        seeds[i] = (stencil == 6 ? u[axis] : length) / (2.0f * h);
+        double square = (double)u[0] * (double)u[0] + (double)u[1] * (double)u[1] + (double)u[2] * (double)u[2];
+        double length = sqrt(square), h = (double)(i % 2 ? -delta : delta); /* of 1e-30 and 1e30, too */
+        for (size_t k = 0; k < 3; k++) {
+            double along = length > 0.0 ? h / length * (double)u[k] : 0.0, one = k == axis ? h : 0.0;
+            moved[3 * i + k] = p[k] + (float)(stencil == 6 ? one : along);
+        }
+        seeds[i] = (float)((stencil == 6 ? (double)u[axis] : length) / (2.0 * h));
     }
     if (pulls) memset(pulls, 0, 3 * count * sizeof(float));
     if (d_weights)
@@ -4673,10 +4676,10 @@ DIST_API dist_status dist_field_eikonal(dist_context *ctx, const dist_field *fie
     const char *name = "dist_field_eikonal";
     double *d_code = NULL, sum = 0.0;
     dist_status status = disti_enter(ctx);
-    if (loss) *loss = 0.0f;
     if (status == DIST_OK) status = disti_field_check(ctx, field, name);
     if (status == DIST_OK) status = disti_count_check(ctx, n, name);
     if (status == DIST_OK && grads) status = disti_gradients_plain(ctx, field, grads, name);
+    if (status == DIST_OK && n == 0 && loss) *loss = 0.0f;
     if (status != DIST_OK || n == 0) return status;
     if (!points) return disti_refuse(ctx, "%s: points is NULL", name);
     if (!disti_finite(weight))
@@ -9415,6 +9418,7 @@ DIST_API dist_camera dist_camera_look_at(int width, int height, float fov_y, con
     camera.height = height;
     if (fov_y > 0.0f && fov_y < 3.14159265f) /* else 0, as below: refused by whoever takes the camera */
         camera.fx = camera.fy = (float)(height / 2.0 / tan((double)fov_y / 2.0));
+    if (!disti_finite(camera.fx)) camera.fx = camera.fy = 0.0f;
     camera.cx = (float)((width - 1.0) / 2.0);
     camera.cy = (float)((height - 1.0) / 2.0);
     if ((eye && !disti_finite_all(3, eye)) || (at && !disti_finite_all(3, at)) || (up && !disti_finite_all(3, up)))
@@ -15580,9 +15584,8 @@ DIST_API float dist_loss_photometric(const dist_photo *to, const dist_photo *fro
     disti_photo_pair pair;
     double sum[4] = {0.0, 0.0, 0.0, 0.0}, again[4] = {0.0, 0.0, 0.0, 0.0}, scale[2], d_pose[12], turned[3];
     float ssim = desc ? desc->ssim : 0.0f, visibility = desc ? desc->visibility : 0.0f;
-    if (!to || !from || !to->color || !to->depth || !from->color || !(ssim >= 0.0f && ssim <= 1.0f) ||
-        visibility != visibility)
-        return 0.0f;
+    if (!to || !from || !to->color || !to->depth || !from->color) return 0.0f;
+    if (!(ssim >= 0.0f && ssim <= 1.0f) || !disti_finite(visibility)) return 0.0f;
     if (disti_camera_check(NULL, &to->camera, "") != DIST_OK || disti_camera_check(NULL, &from->camera, "") != DIST_OK)
         return 0.0f;
     if (!disti_finite(weight)) weight = 0.0f; /* what is seen is told all the same */
@@ -15710,6 +15713,21 @@ static int disti_mesh_add_triangle(dist_mesh *mesh, unsigned a, unsigned b, unsi
     return 1;
 }
 
+/* 0 after disti_fail if an array is missing. */
+static int disti_mesh_arrays(dist_context *ctx, const char *name, size_t vertex_count, const float *vertices,
+                             size_t triangle_count, const unsigned *triangles)
+{
+    if (vertex_count && !vertices) disti_refuse(ctx, "%s: vertices is NULL, but its count is not 0", name);
+    else if (triangle_count && !triangles) disti_refuse(ctx, "%s: triangles is NULL, but its count is not 0", name);
+    else return 1;
+    return 0;
+}
+
+static int disti_mesh_whole(dist_context *ctx, const char *name, const dist_mesh *mesh)
+{
+    return disti_mesh_arrays(ctx, name, mesh->vertex_count, mesh->vertices, mesh->triangle_count, mesh->triangles);
+}
+
 /* 0 after disti_fail if a triangle has a vertex that is not there. */
 static int disti_mesh_check(dist_context *ctx, const dist_mesh *mesh, dist_status status, const char *format,
                             const char *text)
@@ -15726,11 +15744,7 @@ DIST_API dist_mesh *dist_mesh_create(dist_context *ctx, size_t vertex_count, con
                                      size_t triangle_count, const unsigned *triangles)
 {
     if (disti_enter(ctx) != DIST_OK) return NULL;
-    if ((vertex_count && !vertices) || (triangle_count && !triangles)) {
-        disti_refuse(ctx, "dist_mesh_create: %s is NULL, but its count is not 0",
-                     vertex_count && !vertices ? "vertices" : "triangles");
-        return NULL;
-    }
+    if (!disti_mesh_arrays(ctx, "dist_mesh_create", vertex_count, vertices, triangle_count, triangles)) return NULL;
     if (vertex_count > 0xfffffffeu || triangle_count > (size_t)-1 / (3 * sizeof(unsigned))) {
         disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_create: %d vertices and %d triangles are more than there can be",
                    NULL, (double)vertex_count, (double)triangle_count);
@@ -16174,6 +16188,7 @@ DIST_API dist_status dist_mesh_backward(dist_context *ctx, const dist_field *fie
     if (status != DIST_OK) return status;
     if (!mesh || (mesh->vertex_count && !d_vertices))
         return disti_refuse(ctx, "dist_mesh_backward: %s is NULL", mesh ? "d_vertices" : "mesh");
+    if (!disti_mesh_whole(ctx, name, mesh)) return DIST_BAD_ARGUMENT;
     for (size_t i = 0; i < mesh->vertex_count; i++)
         if (!disti_finite_all(3, d_vertices + 3 * i))
             return disti_fail(ctx, DIST_NOT_FINITE, "%s: d_vertices of vertex %d is not finite", name, (double)i, 0);
@@ -16229,6 +16244,7 @@ DIST_API dist_status dist_mesh_sample(dist_context *ctx, const dist_mesh *mesh, 
     if (status != DIST_OK) return status;
     if (!mesh || (n && !points)) return disti_refuse(ctx, "dist_mesh_sample: %s is NULL", mesh ? "points" : "mesh");
     if (count == 0) return disti_refuse(ctx, "%s: the mesh has no triangles", name);
+    if (!disti_mesh_whole(ctx, name, mesh)) return DIST_BAD_ARGUMENT;
     if (!disti_mesh_check(ctx, mesh, DIST_BAD_ARGUMENT, "%s: a triangle has vertex %d, must be below %d", name))
         return DIST_BAD_ARGUMENT;
     disti_size_mul(count, sizeof(double), &bytes);
@@ -17115,6 +17131,7 @@ DIST_API dist_status dist_mesh_write(dist_context *ctx, const dist_mesh *mesh, i
     if (format != DIST_MESH_PLY && format != DIST_MESH_OBJ)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: format is %d, must be DIST_MESH_PLY or DIST_MESH_OBJ", name,
                           format, 0);
+    if (!disti_mesh_whole(ctx, name, mesh)) return DIST_BAD_ARGUMENT;
     for (size_t i = 0; i < mesh->vertex_count; i++)
         if (!disti_finite_all(3, mesh->vertices + 3 * i) ||
             (mesh->normals && !disti_finite_all(3, mesh->normals + 3 * i)))

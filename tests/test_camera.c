@@ -138,12 +138,14 @@ TEST(look_at_of_garbage_gives_a_camera_that_render_refuses)
     float nan;
     memcpy(&nan, &bits, sizeof nan);
     float bad[3] = {nan, 0, 2};
-    const dist_camera cameras[8] = {
+    const dist_camera cameras[9] = {
+        dist_camera_look_at(8, 8, 2e-38f, eye, at, up) /* fx beyond a float */,
         dist_camera_look_at(8, 8, nan, eye, at, up), dist_camera_look_at(8, 8, 0.7f, bad, at, up),
         dist_camera_look_at(8, 8, 0.7f, eye, bad, up), dist_camera_look_at(8, 8, 0.0f, eye, at, up),
         dist_camera_look_at(8, 8, 50.0f, eye, at, up) /* degrees */, dist_camera_look_at(8, 8, -1.0f, eye, at, up),
         dist_camera_look_at(8, 8, 3.2f, eye, at, up), dist_camera_look_at(8, 8, 1e30f, eye, at, up)};
-    for (int k = 0; k < 8; k++) {
+    CHECK_NEAR(0.0, (double)cameras[0].fx, 0);
+    for (int k = 0; k < 9; k++) {
         dist_context_clear(ctx);
         CHECK(dist_render(ctx, &field, &cameras[k], NULL, &out, NULL) < 0);
         CHECK_TEXT("dist_render: camera", dist_context_message(ctx));

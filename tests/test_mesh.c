@@ -608,6 +608,25 @@ TEST(a_mesh_of_ones_own_is_checked)
     CHECK_STATUS(DIST_BAD_ARGUMENT, dist_mesh_write(ctx, mesh, DIST_MESH_PLY, NULL, 0, &size), ctx);
     CHECK_TEXT("dist_mesh_write: a triangle has vertex 9", dist_context_message(ctx));
     dist_context_clear(ctx);
+    mesh->triangles[2] = 2;
+    for (int missing = 0; missing < 2; missing++) {
+        dist_mesh part = *mesh;
+        const char *text = missing ? "triangles is NULL, but its count" : "vertices is NULL, but its count";
+        if (missing) part.triangles = NULL;
+        else part.vertices = NULL;
+        CHECK_STATUS(DIST_BAD_ARGUMENT, dist_mesh_sample(ctx, &part, 1, 1, point), ctx);
+        CHECK_TEXT(text, dist_context_message(ctx));
+        dist_context_clear(ctx);
+        CHECK_STATUS(DIST_BAD_ARGUMENT, dist_mesh_write(ctx, &part, DIST_MESH_OBJ, NULL, 0, &size), ctx);
+        CHECK_TEXT(text, dist_context_message(ctx));
+        dist_context_clear(ctx);
+        if (missing) continue;
+        dist_gradients grads;
+        memset(&grads, 0, sizeof grads);
+        CHECK_STATUS(DIST_BAD_ARGUMENT, dist_mesh_backward(ctx, NULL, &part, vertices, &grads), ctx);
+        CHECK_TEXT(text, dist_context_message(ctx));
+        dist_context_clear(ctx);
+    }
     CHECK_STATUS(DIST_OK, dist_context_status(other), other);
     dist_mesh_destroy(mesh);
     dist_context_destroy(other);

@@ -499,7 +499,8 @@ TEST(photometric_loss_of_bad_arguments_is_zero)
     CHECK_NEAR(0, dist_loss_photometric(&c.to, &c.from, &desc, (float)NAN, d_depth, NULL), 0);
     CHECK_NEAR(0, dist_loss_photometric(NULL, &c.from, NULL, 1.0f, d_depth, NULL), 0);
     CHECK_NEAR(0, dist_loss_photometric(&c.to, NULL, NULL, 1.0f, d_depth, NULL), 0);
-    desc.visibility = (float)NAN;
+    uint32_t bits = 0x7fc00000u;
+    memcpy(&desc.visibility, &bits, sizeof bits);
     CHECK_NEAR(0, dist_loss_photometric(&c.to, &c.from, &desc, 1.0f, d_depth, NULL), 0);
     desc.visibility = 0.0f;
     desc.ssim = 1.5f;

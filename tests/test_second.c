@@ -590,6 +590,12 @@ TEST(eikonal_term_of_a_field_without_second_derivatives_is_by_differences)
     CHECK_NEAR(0.5 * 0.36, (double)loss, 1e-6);
     CHECK_NEAR(1.0 + 0.5 * 2.0 * 0.6, (double)code[0], 2e-4); /* added to */
     CHECK_NEAR(2.0, (double)code[1], 2e-4);
+    for (int power = -30; power <= 30; power += 5) { /* linear in the weight, whatever that is */
+        float weight = (float)pow(10.0, power);
+        code[0] = 0.0f;
+        CHECK_STATUS(DIST_OK, dist_field_eikonal(ctx, &field, MANY, points, weight, NULL, &grads), ctx);
+        CHECK_NEAR(1.2, (double)code[0] / (double)weight, 4e-4);
+    }
     dist_context_destroy(ctx);
 }
 
@@ -720,6 +726,7 @@ TEST(eikonal_of_points_that_are_not_finite_is_left_out_and_nonsense_refused)
     CHECK_NEAR(2.0, (double)loss, 1e-5);
     CHECK_STATUS(DIST_OK, dist_field_eikonal(ctx, &field, 0, NULL, 3.0f, &loss, NULL), ctx);
     CHECK_NEAR(0.0, (double)loss, 0);
+    loss = 7.0f; /* what errors leave alone */
     CHECK_EQUAL(DIST_BAD_ARGUMENT, dist_field_eikonal(ctx, &field, 2, NULL, 1.0f, &loss, NULL));
     CHECK_EQUAL(DIST_BAD_ARGUMENT, dist_field_eikonal(ctx, NULL, 2, good, 1.0f, &loss, NULL));
     CHECK_EQUAL(DIST_BAD_ARGUMENT, dist_field_eikonal(ctx, &field, 2, good, points[3], &loss, NULL));
@@ -729,6 +736,7 @@ TEST(eikonal_of_points_that_are_not_finite_is_left_out_and_nonsense_refused)
     grads.rotation = NULL;
     grads.weights = three;
     CHECK_EQUAL(DIST_UNSUPPORTED, dist_field_eikonal(ctx, &field, 2, good, 1.0f, &loss, &grads));
+    CHECK_NEAR(7.0, (double)loss, 0);
     grads.weights = NULL;
     grads.code = code;
     dist_context_clear(ctx);

@@ -423,8 +423,9 @@ typedef struct dist_net_desc {
     int output_linear;/* 0: tanh at the end, 1: nothing */
     int levels;       /* Fourier levels beside the point: sin and cos of pi 2^k p, k below levels; at most 16 */
     int color;        /* 1: a texture: r, g, b in place of the distance, with a sigmoid at the end unless linear */
-    int geometric;    /* 1: starts near the distance to a sphere of half the bound (ReLU; softplus where scale * bound
-                         is some 200 or more), Fourier levels without a share in it; 0: PyTorch's start */
+    int geometric;    /* 1: starts near the distance to a sphere of half the bound, where f is 0 in the mean; for ReLU,
+                         and softplus where scale * bound is some 30 or more (f grows slower than the distance then:
+                         by half of it at 100). Fourier levels have no share in it. 0: PyTorch's start */
     float bound;      /* radius of the sphere that holds the shape, 1e-6 to 1e6; 0: 1 */
     float clamp;      /* 0: 0.1 with a code, none without */
     unsigned seed;
@@ -1833,7 +1834,7 @@ DIST_API int dist_context_workers(const dist_context *ctx)
 enum { DISTI_BLOCK = 48 };
 
 /* forward   y[o][c] = bias[o] + sum_k weights(o, k) x[k][c]     k ascending over alive[0..alive_count-1], or all rows
-             with relu or mask: y = max(0, y); bit c of mask[o] = y[o][c] > 0
+             with relu or mask: y = max(0, y), which leaves NaN; bit c of mask[o] = y[o][c] > 0, or NaN
    Leaving out rows that are zero for the whole block changes no bit of the result.
    All matrices are 64-byte aligned; y, bias and mask hold `out` rounded up to a multiple of 8; columns beyond `columns`
    may be computed from what stands there, up to DISTI_BLOCK, but their mask bits are 0. */
@@ -1869,12 +1870,13 @@ typedef struct disti_gemm_weights {
 } disti_gemm_weights;
 
 /* Few points: y[c][o] = max(0, bias[o] + sum_k weights(o, k) x[c][k]), gemm's bits, over the rows listed in ascending
-   order; most[o] = the largest of y[.][o]. bias, y and most are written or read up to out rounded up to 8. */
+   order; sum[o] = that of y[.][o], 0 only where all are. bias, y and sum are written or read up to out rounded up to
+   8. */
 enum { DISTI_FEW_POINTS = 12 };
 typedef struct disti_few {
     const float *weights, *bias, *x; /* x (points, stride) */
     const int *list;
-    float *y, *most; /* y (points, stride) */
+    float *y, *sum; /* y (points, stride) */
     size_t stride;
     int rows, count, out, points;
 } disti_few;
@@ -1994,8 +1996,8 @@ static void disti_gemm_rows(const disti_gemm *g, int o, int p)
         for (int c = 0; c < g->columns; c++) {
             y[c] += 0.0f; /* minus zero becomes zero, so that a zero row left out cannot show in its sign */
             if (!g->mask && !g->relu) continue;
-            if (y[c] > 0.0f) bits |= (uint64_t)1 << c;
-            else y[c] = 0.0f;
+            if (y[c] <= 0.0f) y[c] = 0.0f;
+            else bits |= (uint64_t)1 << c;
         }
         if (g->mask) g->mask[both[r]] = bits;
     }
@@ -2139,7 +2141,7 @@ DISTI_INLINE float disti_tanh(float x)
                                 1.33314422036e-1f) * s - 3.33332819422e-1f);
     float large = (1.0f - e) * (1.0f / (1.0f + e));
     large = x < 0.0f ? -large : large;
-    return s < 0.390625f ? inner : large;
+    return s >= 0.390625f ? large : inner;
 }
 
 DISTI_INLINE float disti_sigmoid(float x)
@@ -2223,31 +2225,31 @@ DISTI_INLINE float disti_sine(double a, float *cosine)
     return disti_flip(disti_sine_half((float)r), k);
 }
 
-/* activation(x), *slope gets its derivative. scale: softplus's beta, sine's omega. */
+/* activation(x), of NaN NaN, *slope gets its derivative, which is finite. scale: softplus's beta, sine's omega. */
 DISTI_INLINE float disti_activate_one(int activation, float scale, float x, float *slope)
 {
     float v = x, d = 1.0f;
     switch (activation) {
     case DIST_ACTIVATION_RELU:
-        d = x > 0.0f ? 1.0f : 0.0f;
-        v = x > 0.0f ? x : 0.0f;
+        d = x <= 0.0f ? 0.0f : 1.0f;
+        v = x <= 0.0f ? 0.0f : x;
         break;
     case DIST_ACTIVATION_ELU: {
         float near_zero = x * (1.0f + x * (0.5f + x * (1.0f / 6 + x * (1.0f / 24 + x * (1.0f / 120)))));
-        float e = disti_exp(x), below = x > -0.1f ? near_zero : e - 1.0f;
+        float e = disti_exp(x), below = x <= -0.1f ? e - 1.0f : near_zero;
         v = x > 0.0f ? x : below;
         d = x > 0.0f ? 1.0f : e;
         break;
     }
     case DIST_ACTIVATION_SOFTPLUS: {
         float a = scale * x;
-        v = (x > 0.0f ? x : 0.0f) + disti_log1p_exp(a) * (1.0f / scale);
+        v = (x < 0.0f ? 0.0f : x) + disti_log1p_exp(a) * (1.0f / scale);
         d = disti_sigmoid(a);
         break;
     }
     case DIST_ACTIVATION_SINE: {
         float most = 1e9f / scale, within = x < most ? x : 0.0f; /* also for NaN */
-        v = disti_sine((double)scale * (double)(within > -most ? within : 0.0f), &d);
+        v = disti_sine((double)scale * (double)(within > -most ? within : 0.0f), &d) + (x - x);
         d *= scale;
         break;
     }
@@ -2436,14 +2438,14 @@ DISTI_INLINE void disti_norm_backward(int units, const float *gamma, size_t half
                                             d[u + half + c] * inverse[half + c]);
 }
 
-/* y <- max(0, y) and the bits of the positive lanes of each row */
+/* y <- max(0, y) and the bits of the lanes of each row that are positive, or NaN */
 static void disti_relu_scalar(size_t rows, float *y, uint64_t *mask)
 {
     for (size_t u = 0; u < rows; u++) {
         mask[u] = 0;
         for (size_t c = 0; c < DISTI_BLOCK; c++) {
-            if (y[u * DISTI_BLOCK + c] > 0.0f) mask[u] |= (uint64_t)1 << c;
-            else y[u * DISTI_BLOCK + c] = 0.0f;
+            if (y[u * DISTI_BLOCK + c] <= 0.0f) y[u * DISTI_BLOCK + c] = 0.0f;
+            else mask[u] |= (uint64_t)1 << c;
         }
     }
 }
@@ -2452,13 +2454,13 @@ static void disti_few_scalar(const disti_few *g)
 {
     for (int o = 0; o < (g->out + 7) / 8 * 8; o += 8) {
         const float *weights = g->weights + (size_t)o * (size_t)g->rows, *bias = g->bias + o;
-        for (int i = 0; i < 8; i++) g->most[o + i] = 0.0f;
+        for (int i = 0; i < 8; i++) g->sum[o + i] = 0.0f;
         for (size_t c = 0; c < (size_t)g->points; c++) {
             const float *x = g->x + c * g->stride;
             float *y = g->y + c * g->stride + o;
 #define DISTI_BEGIN(j) float a##j = bias[j], b##j = bias[4 + j];
 #define DISTI_TERM(j) a##j += w[j] * x[k]; b##j += w[4 + j] * x[k];
-#define DISTI_END(j) y[j] = a##j > 0.0f ? a##j : 0.0f; y[4 + j] = b##j > 0.0f ? b##j : 0.0f;
+#define DISTI_END(j) y[j] = a##j <= 0.0f ? 0.0f : a##j; y[4 + j] = b##j <= 0.0f ? 0.0f : b##j;
             DISTI_FOUR(DISTI_BEGIN)
             for (int i = 0; i < g->count; i++) {
                 const size_t k = (size_t)g->list[i];
@@ -2469,7 +2471,7 @@ static void disti_few_scalar(const disti_few *g)
 #undef DISTI_BEGIN
 #undef DISTI_TERM
 #undef DISTI_END
-            for (int i = 0; i < 8; i++) g->most[o + i] = DISTI_MAX(g->most[o + i], y[i]);
+            for (int i = 0; i < 8; i++) g->sum[o + i] += y[i];
         }
     }
 }
@@ -2660,7 +2662,8 @@ DISTI_PLAIN(scalar, static)
      DISTI_VEC, DISTI_LANES             a vector, and how many floats it holds
      DISTI_SET1(s) DISTI_LOAD(p) DISTI_STORE(p, v) DISTI_ADD(a, b)
      DISTI_FMA(c, a, b)                 c += a b, in place: from intrinsics gcc makes copies and runs out of registers
-     DISTI_RELU(v) DISTI_POSITIVE(v)    max(v, 0), and the bits of the lanes that are greater than 0
+     DISTI_RELU(v) DISTI_POSITIVE(v)    max(v, 0), and the bits of the lanes that are greater than 0: NaN stays and is
+                                        greater (of two numbers of which one is NaN, x86's max is the second)
      DISTI_BITS(row, column, v)         the latter into a mask's row, from this column on
      DISTI_KEEP(v, bits)                v with 0 where the lane's bit is 0
      DISTI_TALL(isa)                    tiles of one vector's columns, where there are registers for sixteen rows
@@ -3063,14 +3066,14 @@ DISTI_PLAIN(scalar, static)
 #define DISTI_FEW_ROW(i, V) { const DISTI_VEC b = DISTI_SET1(x##i[k]); DISTI_X##V(DISTI_FEW_MAC, i) }
 #define DISTI_FEW_STORE1(i, j)                                                                                         \
     a##i##j = DISTI_RELU(DISTI_ADD(a##i##j, DISTI_TWO(g->bias + at##j, g->bias + to##j)));                             \
-    m##j = DISTI_GREATER(m##j, a##i##j);                                                                               \
+    m##j = DISTI_ADD(m##j, a##i##j);                                                                                   \
     DISTI_TWO_STORE(y + at##j, y + to##j, a##i##j)
 #define DISTI_FEW_STORE(i, V)                                                                                          \
     {                                                                                                                  \
         float *y = g->y + (size_t)(unsigned)DISTI_MIN(i, g->points - 1) * g->stride;                                   \
         DISTI_X##V(DISTI_FEW_STORE1, i)                                                                                \
     }
-#define DISTI_FEW_MOST(i, j) DISTI_TWO_STORE(g->most + at##j, g->most + to##j, m##j)
+#define DISTI_FEW_SUM(i, j) DISTI_TWO_STORE(g->sum + at##j, g->sum + to##j, m##j)
 #define DISTI_FEW_TILE(name, P, V)                                                                                     \
     DISTI_NOINLINE DISTI_FUNCTION void disti_few_##name(const disti_few *g)                                            \
     {                                                                                                                  \
@@ -3087,7 +3090,7 @@ DISTI_PLAIN(scalar, static)
                 DISTI_FENCE                                                                                            \
             }                                                                                                          \
             DISTI_Y##P(DISTI_FEW_STORE, V)                                                                             \
-            DISTI_X##V(DISTI_FEW_MOST, 0)                                                                              \
+            DISTI_X##V(DISTI_FEW_SUM, 0)                                                                               \
         }                                                                                                              \
     }
 
@@ -3222,8 +3225,8 @@ static const int *disti_back_rows(const disti_gemm_back *g, int rows, int n, int
 #define DISTI_STORE(p, v) _mm_storeu_ps(p, v)
 #define DISTI_ADD(a, b) _mm_add_ps(a, b)
 #define DISTI_FMA(c, a, b) c = _mm_add_ps(_mm_mul_ps(a, b), c)
-#define DISTI_RELU(v) _mm_max_ps(v, _mm_setzero_ps())
-#define DISTI_POSITIVE(v) (unsigned)_mm_movemask_ps(_mm_cmpgt_ps(v, _mm_setzero_ps()))
+#define DISTI_RELU(v) _mm_max_ps(_mm_setzero_ps(), v)
+#define DISTI_POSITIVE(v) (unsigned)_mm_movemask_ps(_mm_cmpnle_ps(v, _mm_setzero_ps()))
 #define DISTI_BITS(row, column, v) *(row) |= (uint64_t)DISTI_POSITIVE(v) << (column);
 #define DISTI_KEEP(v, bits) disti_keep_sse2(v, (int)((bits) & 0xf))
 DISTI_FUNCTION __m128 disti_keep_sse2(__m128 v, int bits)
@@ -3274,8 +3277,8 @@ DISTI_FEW_TILE(four_sse2, 4, 2)
 #else
 #define DISTI_FMA(c, a, b) __asm__("vfmadd231ps %1, %2, %0" : "+x"(c) : "x"(b), "x"(a))
 #endif
-#define DISTI_RELU(v) _mm256_max_ps(v, _mm256_setzero_ps())
-#define DISTI_POSITIVE(v) (unsigned)_mm256_movemask_ps(_mm256_cmp_ps(v, _mm256_setzero_ps(), _CMP_GT_OQ))
+#define DISTI_RELU(v) _mm256_max_ps(_mm256_setzero_ps(), v)
+#define DISTI_POSITIVE(v) (unsigned)_mm256_movemask_ps(_mm256_cmp_ps(v, _mm256_setzero_ps(), _CMP_NLE_UQ))
 #define DISTI_BITS(row, column, v) ((unsigned char *)(row))[(column) / 8] = (unsigned char)DISTI_POSITIVE(v);
 #define DISTI_KEEP(v, bits) disti_keep_avx2(v, (int)((bits) & 0xff))
 DISTI_FUNCTION __m256 disti_keep_avx2(__m256 v, int bits)
@@ -3340,8 +3343,8 @@ static const disti_part disti_parts_avx2[] = {{9, 18, 6}, {25, 30, 24}, {33, 40,
 #define DISTI_FMA(c, a, b) __asm__("vfmadd231ps %1, %2, %0" : "+v"(c) : "v"(b), "v"(a))
 #endif
 /* Unmasked, gcc 12 warns in C++ that its own header uses an uninitialized variable. */
-#define DISTI_RELU(v) _mm512_maskz_max_ps((__mmask16)0xffff, v, _mm512_setzero_ps())
-#define DISTI_POSITIVE(v) _mm512_cmp_ps_mask(v, _mm512_setzero_ps(), _CMP_GT_OQ)
+#define DISTI_RELU(v) _mm512_maskz_max_ps((__mmask16)0xffff, _mm512_setzero_ps(), v)
+#define DISTI_POSITIVE(v) _mm512_cmp_ps_mask(v, _mm512_setzero_ps(), _CMP_NLE_UQ)
 #define DISTI_BITS(row, column, v) \
     { const __mmask16 m = DISTI_POSITIVE(v); memcpy((char *)(row) + (column) / 8, &m, sizeof m); }
 #define DISTI_KEEP(v, bits) _mm512_maskz_mov_ps((__mmask16)((bits) & 0xffff), v)
@@ -3666,13 +3669,12 @@ DISTI_HALF_KERNEL(bf16)
 #define DISTI_KEEP(v, bits) disti_keep_neon(v, (uint32_t)((bits) & 0xf))
 static float32x4_t disti_positive_part(float32x4_t v)
 {
-    const uint32x4_t positive = vcgtq_f32(v, vdupq_n_f32(0.0f));
-    return vreinterpretq_f32_u32(vandq_u32(vreinterpretq_u32_f32(v), positive));
+    return vreinterpretq_f32_u32(vbicq_u32(vreinterpretq_u32_f32(v), vcleq_f32(v, vdupq_n_f32(0.0f))));
 }
 static unsigned disti_positive_neon(float32x4_t v)
 {
     static const uint32_t lane[4] = {1, 2, 4, 8};
-    return vaddvq_u32(vandq_u32(vcgtq_f32(v, vdupq_n_f32(0.0f)), vld1q_u32(lane)));
+    return vaddvq_u32(vbicq_u32(vld1q_u32(lane), vcleq_f32(v, vdupq_n_f32(0.0f))));
 }
 static float32x4_t disti_keep_neon(float32x4_t v, uint32_t bits)
 {
@@ -3844,7 +3846,7 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_FEW_ROW
 #undef DISTI_FEW_STORE1
 #undef DISTI_FEW_STORE
-#undef DISTI_FEW_MOST
+#undef DISTI_FEW_SUM
 #undef DISTI_FEW_TILE
 #undef DISTI_BOUND
 #undef DISTI_BOUND1
@@ -7012,7 +7014,7 @@ static const float *disti_few_forward(const dist_shape *shape, disti_block *b, d
     const dist_net *net = shape->net;
     size_t width = (size_t)net->max_rows, points = (size_t)b->columns;
     int last = net->layers - 1;
-    float *most = b->delta[0];
+    float *sum = b->delta[0];
     double done = 0.0;
     for (int l = 0; l <= last; l++) {
         const disti_linear *layer = &net->layer[l];
@@ -7020,13 +7022,13 @@ static const float *disti_few_forward(const dist_shape *shape, disti_block *b, d
         int *list = b->alive + (size_t)l * width, count = 0;
         for (int u = 0; u < layer->prev; u++) {
             list[count] = u;
-            count += most[u] > 0.0f;
+            count += !(sum[u] <= 0.0f);
         }
         b->alive_units[l] = count;
         for (int i = 0; i < count && !b->values; i++) { /* for the way back */
             uint64_t *mask = b->mask + (size_t)l * width + list[i];
             *mask = 0;
-            for (size_t c = 0; c < points; c++) *mask |= (uint64_t)(x[c * width + (size_t)list[i]] > 0.0f) << c;
+            for (size_t c = 0; c < points; c++) *mask |= (uint64_t) !(x[c * width + (size_t)list[i]] <= 0.0f) << c;
         }
         for (int i = 0; i < layer->point; i++, count++) {
             b->mask[(size_t)l * width + (size_t)(layer->prev + i)] = ~(uint64_t)0;
@@ -7042,7 +7044,7 @@ static const float *disti_few_forward(const dist_shape *shape, disti_block *b, d
         few.x = x;
         few.list = list;
         few.y = b->act[(l + 1) & 1];
-        few.most = most;
+        few.sum = sum;
         few.stride = width;
         few.rows = layer->prev + layer->point;
         few.count = count;
@@ -9196,12 +9198,57 @@ static double disti_normal(uint64_t *state)
     return sqrt(-2.0 * log(1.0 - u)) * c;
 }
 
-/* PyTorch's start: uniform within 1 / sqrt(in). SIREN's: within 1 / in at first, sqrt(6 / in) / omega then.
-   Geometric (Atzmon and Lipman 2020): normal, sigma sqrt(2 / out), the last layer's mean sqrt(pi / in), bias -radius;
-   columns of the code, of Fourier levels and skipped-in ones 0, so that f starts near |p| - radius. */
-static void disti_net_randomize(dist_net *net, const dist_net_desc *desc)
+/* A geometric start's points: on a sphere, evenly. */
+enum { DISTI_START_POINTS = 16 };
+
+/* The last biases, so that the mean of f before its end is 0 over points at half the bound. -radius would do for ReLU
+   in wide layers alone: softplus is log(2) / beta at 0, and 8 layers of 512 units with beta 100 add that up to
+   f(0) = 0. */
+static dist_status disti_net_center(dist_context *ctx, dist_net *net)
 {
-    uint64_t state = ((uint64_t)desc->seed << 1 | 1) * 0x9e3779b97f4a7c15u;
+    enum { N = DISTI_START_POINTS };
+    const double count = N;
+    float *x = (float *)disti_alloc_array(ctx, 2 * (size_t)net->max_rows, N * sizeof(float));
+    if (!x) return DIST_OUT_OF_MEMORY;
+    float *in = x, *out = x + (size_t)net->max_rows * N;
+    memset(in, 0, (size_t)net->max_rows * N * sizeof(float));
+    for (int i = 0; i < N; i++) {
+        double s, c, z = 1.0 - (2.0 * i + 1.0) / count, r = 0.5 * (double)net->bound;
+        disti_sincos(2.39996322972865332 * i, &s, &c); /* the golden angle */
+        in[i] = (float)(r * sqrt(1.0 - z * z) * c);
+        in[N + i] = (float)(r * sqrt(1.0 - z * z) * s);
+        in[2 * N + i] = (float)(r * z);
+    }
+    for (int l = 0; l < net->layers; l++) {
+        const disti_linear *layer = &net->layer[l];
+        int rows = l == 0 ? 3 : layer->prev, first = l == 0 ? layer->point_column : layer->x_column;
+        for (int o = 0; o < layer->out; o++) {
+            const float *w = net->params + layer->weight + (size_t)o * (size_t)layer->in + (size_t)first;
+            float sum[N] = {0};
+            double mean = 0.0;
+            for (int k = 0; k < rows; k++)
+                for (int i = 0; i < N; i++) sum[i] += w[k] * in[k * N + i];
+            for (int i = 0; i < N; i++) mean += (double)sum[i] / count;
+            if (l + 1 == net->layers) net->params[layer->bias + (size_t)o] = (float)-mean;
+            else memcpy(out + (size_t)o * N, sum, sizeof sum);
+        }
+        if (l + 1 == net->layers) break;
+        disti_activate(net->activation, l == 0 ? net->first_scale : net->scale, (size_t)layer->out * N, out, NULL);
+        float *t = in;
+        in = out;
+        out = t;
+    }
+    disti_free(ctx, x, 2 * (size_t)net->max_rows * N * sizeof(float));
+    return DIST_OK;
+}
+
+/* PyTorch's start: uniform within 1 / sqrt(in). SIREN's: within 1 / in at first, sqrt(6 / in) / omega then.
+   Geometric (Atzmon and Lipman 2020): normal, sigma sqrt(2 / out), the last layer's mean sqrt(pi / in), biases 0;
+   columns of the code, of Fourier levels and skipped-in ones 0, so that f starts near |p| + bias. */
+static dist_status disti_net_randomize(dist_context *ctx, dist_net *net, const dist_net_desc *desc)
+{
+    uint64_t state = desc->seed;
+    state = disti_random_bits(&state); /* else a seed's numbers are its neighbor's, some draws later */
     for (int l = 0; l < net->layers; l++) {
         const disti_linear *layer = &net->layer[l];
         int last = l + 1 == net->layers, sine = net->activation == DIST_ACTIVATION_SINE;
@@ -9222,9 +9269,10 @@ static void disti_net_randomize(dist_net *net, const dist_net_desc *desc)
                 w[k] = (float)x;
             }
             double b = (2.0 * disti_random_unit(&state) - 1.0) * range;
-            net->params[layer->bias + (size_t)o] = desc->geometric ? (last ? -0.5f * net->bound : 0.0f) : (float)b;
+            net->params[layer->bias + (size_t)o] = desc->geometric ? 0.0f : (float)b;
         }
     }
+    return desc->geometric ? disti_net_center(ctx, net) : DIST_OK;
 }
 
 static dist_status disti_net_desc_check(dist_context *ctx, const dist_net_desc *d)
@@ -9289,11 +9337,11 @@ DIST_API dist_net *dist_net_create(dist_context *ctx, const dist_net_desc *desc)
         net->layer[l].out = l + 1 == net->layers ? net->channels : d.width;
         net->layer[l].in = (l > 0 ? d.width : 0) + (l == 0 || skip[l] ? net->point_size + d.code_size : 0);
     }
-    if (disti_net_arrange(ctx, net, "dist_net_create", skip, 1.0f) != DIST_OK) {
+    if (disti_net_arrange(ctx, net, "dist_net_create", skip, 1.0f) != DIST_OK ||
+        disti_net_randomize(ctx, net, &d) != DIST_OK) {
         dist_net_destroy(net);
         return NULL;
     }
-    disti_net_randomize(net, &d);
     if (net->codes) memset(net->codes, 0, (size_t)net->code_count * (size_t)net->code_size * sizeof(float));
     disti_net_pack(net);
     return net;

@@ -703,37 +703,63 @@ static dist_net_desc small_desc(void)
     return d;
 }
 
+/* The mean and the largest deviation from it of f at |p| = r. */
+static double sphere_mean(dist_context *ctx, const dist_field *field, double r, double *deviation)
+{
+    enum { N = 200 };
+    float points[3 * N], sdf[N];
+    double mean = 0.0;
+    test_random random = test_random_seed(1);
+    for (int i = 0; i < N; i++) {
+        float *p = points + 3 * i, length = 0.0f;
+        while (!(length > 0.1f && length < 1.0f)) {
+            test_random_fill(&random, 3, p, -1.0f, 1.0f);
+            length = sqrtf(p[0] * p[0] + p[1] * p[1] + p[2] * p[2]);
+        }
+        for (int k = 0; k < 3; k++) p[k] *= (float)r / length;
+    }
+    CHECK_STATUS(DIST_OK, dist_field_eval(ctx, field, N, points, sdf, NULL), ctx);
+    for (int i = 0; i < N; i++) mean += (double)sdf[i] / N;
+    *deviation = 0.0;
+    for (int i = 0; i < N; i++) *deviation = fmax(*deviation, fabs((double)sdf[i] - mean));
+    return mean;
+}
+
 TEST(a_geometric_start_is_near_the_distance_to_a_sphere_of_half_the_bound)
 {
-    static const int activations[2] = {DIST_ACTIVATION_RELU, DIST_ACTIVATION_SOFTPLUS};
-    static const float bounds[2] = {1.0f, 2.0f};
-    for (int k = 0; k < 8; k++) { /* the last four with Fourier levels, which have no share in it */
-        enum { N = 200 };
+    static const struct start {
+        int layers, width, activation, levels;
+        float scale, bound;
+        double least; /* f at the bound, less that at 0, in bounds */
+    } starts[9] = {{4, 256, DIST_ACTIVATION_RELU, 0, 0, 1, 0.7},      {4, 256, DIST_ACTIVATION_RELU, 6, 0, 2, 0.7},
+                   {4, 64, DIST_ACTIVATION_RELU, 0, 0, 1, 0.6},       {8, 512, DIST_ACTIVATION_RELU, 0, 0, 1, 0.7},
+                   {4, 256, DIST_ACTIVATION_SOFTPLUS, 6, 0, 1, 0.5},  {4, 256, DIST_ACTIVATION_SOFTPLUS, 0, 0, 2, 0.6},
+                   {8, 512, DIST_ACTIVATION_SOFTPLUS, 0, 0, 1, 0.4},  {8, 512, DIST_ACTIVATION_SOFTPLUS, 0, 30, 1, 0.1},
+                   {8, 512, DIST_ACTIVATION_SOFTPLUS, 0, 100, 0.4f, 0.1}};
+    for (int k = 0; k < 9; k++) {
+        const struct start *start = &starts[k];
+        double bound = (double)start->bound, half, all;
         dist_context *ctx = test_context();
         dist_net_desc d = small_desc();
-        float points[3 * N], sdf[N], code[5] = {1, -1, 0.5f, 2, 0};
-        double mean = 0.0, worst = 0.0;
-        d.width = 256;
-        d.activation = activations[k / 2 % 2];
-        d.levels = k < 4 ? 0 : 6;
-        d.bound = bounds[k % 2];
+        float code[5] = {1, -1, 0.5f, 2, 0}, zero[3] = {0, 0, 0}, inside;
+        d.layers = start->layers;
+        d.width = start->width;
+        d.activation = start->activation;
+        d.levels = start->levels;
+        d.scale = start->scale;
+        d.bound = start->bound;
         d.geometric = d.output_linear = 1;
         dist_net *net = dist_net_create(ctx, &d);
         dist_shape *shape = dist_shape_create(ctx, net, code);
         dist_field field = dist_shape_field(shape);
-        test_random random = test_random_seed(1);
-        test_random_fill(&random, 3 * N, points, -d.bound, d.bound);
-        CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &field, N, points, sdf, NULL), ctx);
-        for (int i = 0; i < N; i++) {
-            const float *p = points + 3 * i;
-            double r = sqrt((double)p[0] * (double)p[0] + (double)p[1] * (double)p[1] + (double)p[2] * (double)p[2]);
-            double error = fabs((double)sdf[i] - (r - 0.5 * (double)d.bound)) / (double)d.bound;
-            mean += error / N;
-            worst = fmax(worst, error);
-        }
-        CHECK_NEAR(0.0, mean, k < 4 ? 0.15 : 0.2);
-        CHECK_NEAR(0.0, worst, k < 4 ? 0.4 : 0.5);
-        CHECK_NEAR(d.bound, field.radius, 0.0);
+        CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &field, 1, zero, &inside, NULL), ctx);
+        double rise = sphere_mean(ctx, &field, bound, &all) - (double)inside;
+        double middle = sphere_mean(ctx, &field, 0.5 * bound, &half);
+        CHECK(rise > start->least * bound && rise < 1.3 * bound);
+        CHECK((double)inside < -0.2 * rise);
+        CHECK_NEAR(0.0, middle, 0.03 * rise); /* 16 of the sphere's points gave the bias */
+        CHECK(half < 0.35 * rise && all < 0.45 * rise);
+        CHECK_NEAR(bound, field.radius, 0.0);
         dist_shape_destroy(shape);
         dist_net_destroy(net);
         dist_context_destroy(ctx);
@@ -754,6 +780,13 @@ TEST(a_seed_gives_the_same_net_and_another_seed_another)
         REQUIRE(a && b && other);
         CHECK_BYTES(n * sizeof(float), dist_net_weights(a), dist_net_weights(b));
         CHECK(memcmp(dist_net_weights(a), dist_net_weights(other), n * sizeof(float)) != 0);
+        int equal = 0; /* nor are one's numbers the other's, some draws later */
+        for (int i = 0; i < 200; i++)
+            for (int j = 0; j < 200; j++) {
+                float x = dist_net_weights(a)[i], y = dist_net_weights(other)[j];
+                equal += x == y && x != 0.0f;
+            }
+        CHECK(equal < 5);
         dist_net_destroy(a);
         dist_net_destroy(b);
         dist_net_destroy(other);

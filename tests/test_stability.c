@@ -927,6 +927,128 @@ TEST(row_22_nan_and_infinity)
     dist_context_destroy(ctx);
 }
 
+/* wrong: 0 right, 1 A as if not transposed, 2 nothing written, 3 NaN */
+static void wrong_sgemm(void *user, int transpose_a, int transpose_b, int m, int n, int k, float alpha, const float *x,
+                        int ldx, const float *y, int ldy, float beta, float *z, int ldz)
+{
+    int wrong = *(int *)user;
+    for (int i = 0; i < m && wrong != 2; i++)
+        for (int j = 0; j < n; j++) {
+            double sum = 0;
+            for (int l = 0; l < k; l++)
+                sum += (double)(transpose_a && wrong != 1 ? x[l * ldx + i] : x[i * ldx + l]) *
+                       (double)(transpose_b ? y[j * ldy + l] : y[l * ldy + j]);
+            float old = beta > 0 || beta < 0 ? beta * z[i * ldz + j] : 0;
+            z[i * ldz + j] = wrong == 3 ? bits_of(0x7fc00000u) : (float)((double)alpha * sum) + old;
+        }
+}
+
+/* infinity less infinity where x > 0.1, which no layer after it makes an ordinary number */
+static dist_net *overflowing_net(dist_context *ctx)
+{
+    enum { WIDTH = 40 };
+    static float w[4 * WIDTH + 2 * (WIDTH + 1) * WIDTH + WIDTH + 1];
+    dist_net_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.layers = 3;
+    desc.width = WIDTH;
+    desc.output_linear = 1;
+    dist_net *net = dist_net_create(ctx, &desc);
+    memset(w, 0, sizeof w);
+    float *first = w, *second = first + 4 * WIDTH, *third = second + (WIDTH + 1) * WIDTH;
+    float *last = third + (WIDTH + 1) * WIDTH;
+    first[0] = 1e3f;               /* x */
+    first[1 * 3 + 1] = 1;          /* y */
+    first[2 * 3 + 1] = -1;         /* -y */
+    second[0] = second[WIDTH] = 3e38f;
+    second[2 * WIDTH + 1] = second[3 * WIDTH + 2] = 1;
+    third[0] = 1, third[1] = -1;   /* NaN, else 0 */
+    third[WIDTH + 2] = third[WIDTH + 3] = 1; /* |y| */
+    last[0] = last[1] = 1;
+    last[WIDTH] = -0.3f;
+    CHECK_EQUAL(sizeof w / sizeof *w, dist_net_weight_count(net));
+    CHECK_STATUS(DIST_OK, dist_net_set_weights(ctx, net, w), ctx);
+    return net;
+}
+
+TEST(row_22_nan_inside_a_net)
+{
+#if defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__
+    SKIP("-ffinite-math-only");
+#else
+    enum { N = 150 };
+    dist_context *ctx = shape_context();
+    dist_net *net = overflowing_net(ctx);
+    dist_shape *shape = dist_shape_create(ctx, net, NULL);
+    dist_field field = dist_shape_field(shape);
+    test_random r = test_random_seed(22);
+    static const int counts[6] = {1, 5, 12, 13, 48, N};
+    static float p[3 * N], f[N], slope[3 * N], d_f[N], d_weights[4000];
+    for (int i = 0; i < N; i++) {
+        for (int k = 0; k < 3; k++) p[3 * i + k] = test_random_float(&r, -0.5f, 0.5f);
+        p[3 * i] += p[3 * i] > 0 ? 0.1f : -0.1f;
+        d_f[i] = 1;
+    }
+    for (int k = 0; k < 12; k++) {
+        int n = counts[k / 2], wrong = 0;
+        CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &field, (size_t)n, p, f, k % 2 ? slope : NULL), ctx);
+        for (int i = 0; i < n; i++)
+            wrong += p[3 * i] > 0 ? test_finite((double)f[i]) : !(fabsf(f[i] - (fabsf(p[3 * i + 1]) - 0.3f)) < 1e-6f);
+        SAY(wrong == 0, "overflow: wrong values", "NaN there, right elsewhere", wrong);
+    }
+    dist_gradients grads;
+    memset(&grads, 0, sizeof grads);
+    grads.weights = d_weights;
+    CHECK_STATUS(DIST_OK, dist_field_backward(ctx, &field, N, p, d_f, NULL, NULL, NULL, &grads), ctx);
+    double expected = 0;
+    for (int i = 0; i < N; i++) expected += p[3 * i] < 0;
+    SAY(all_finite((size_t)field.weight_count, d_weights) &&
+            fabs((double)d_weights[field.weight_count - 1] - expected) < 1e-3,
+        "overflow: weights' gradient", "of the others", d_weights[field.weight_count - 1]);
+    dist_camera camera = shape_camera(SIDE, SIDE);
+    for (int trace = 0; trace < 2; trace++) {
+        dist_render_desc how = defaults(trace);
+        float g[14];
+        int hits = 0;
+        CHECK_STATUS(DIST_OK, pull_on(ctx, &field, &camera, &how, PULL_ALL, &a, g), ctx);
+        for (int i = 0; i < PIXELS; i++) hits += a.status[i] == DIST_RAY_HIT;
+        SAY(finite_picture(&a) && all_finite(14, g) && hits > 20 && a.stats.not_finite > 100,
+            "overflow: picture and gradients", "finite, rays counted", a.stats.not_finite);
+    }
+    dist_shape_destroy(shape);
+    dist_net_destroy(net);
+    dist_context_destroy(ctx);
+    for (int activation = 0; activation < DIST_ACTIVATION_NONE; activation++) { /* a BLAS that goes wrong */
+        int wrong = 0;
+        dist_context_desc desc = test_context_desc();
+        desc.blas.user = &wrong;
+        desc.blas.sgemm_fn = wrong_sgemm;
+        desc.blas_width = 24;
+        ctx = dist_context_create(&desc);
+        shape = plain_net(ctx, &net, activation, 0, 1, 0);
+        field = dist_shape_field(shape);
+        wrong = 3;
+        int finite = 0;
+        for (int k = 0; k < 12; k++) {
+            CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &field, (size_t)counts[k / 2], p, f, k % 2 ? slope : NULL), ctx);
+            for (int i = 0; i < counts[k / 2]; i++) finite += test_finite((double)f[i]);
+        }
+        SAY(finite == 0, "BLAS that writes NaN: values that are finite", "0", finite);
+        camera = shape_camera(16, 16);
+        for (int trace = 0; trace < 2; trace++) {
+            dist_render_desc how = defaults(trace);
+            float g[14];
+            CHECK_STATUS(DIST_OK, pull_on(ctx, &field, &camera, &how, PULL_ALL, &a, g), ctx);
+            SAY(finite_picture(&a) && all_finite(14, g) && a.stats.hits == 0 && a.stats.not_finite > 100,
+                "BLAS that writes NaN: rays", "not finite, counted", a.stats.not_finite);
+        }
+        dist_shape_destroy(shape);
+        dist_net_destroy(net);
+        dist_context_destroy(ctx);
+    }
+#endif
+}
+
 TEST(row_23_denormals)
 {
     dist_context *ctx = test_context();
@@ -1546,22 +1668,6 @@ TEST(row_42_floating_point_state)
     dist_context_destroy(ctx);
 }
 
-/* wrong: 0 right, 1 A as if not transposed, 2 nothing written, 3 NaN */
-static void wrong_sgemm(void *user, int transpose_a, int transpose_b, int m, int n, int k, float alpha, const float *x,
-                        int ldx, const float *y, int ldy, float beta, float *z, int ldz)
-{
-    int wrong = *(int *)user;
-    for (int i = 0; i < m && wrong != 2; i++)
-        for (int j = 0; j < n; j++) {
-            double sum = 0;
-            for (int l = 0; l < k; l++)
-                sum += (double)(transpose_a && wrong != 1 ? x[l * ldx + i] : x[i * ldx + l]) *
-                       (double)(transpose_b ? y[j * ldy + l] : y[l * ldy + j]);
-            float old = beta > 0 || beta < 0 ? beta * z[i * ldz + j] : 0;
-            z[i * ldz + j] = wrong == 3 ? bits_of(0x7fc00000u) : (float)((double)alpha * sum) + old;
-        }
-}
-
 TEST(row_43_wrong_blas)
 {
     for (int k = 0; k < 4; k++) {
@@ -1814,6 +1920,7 @@ int main(int argc, char **argv)
     ROW(20, row_20_dead_network);
     ROW(21, row_21_sine_networks);
     ROW(22, row_22_nan_and_infinity);
+    ROW(22, row_22_nan_inside_a_net);
     ROW(23, row_23_denormals);
     ROW(24, row_24_huge_codes);
     ROW(25, row_25_sizes);

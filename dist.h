@@ -107,8 +107,9 @@ typedef struct dist_allocator {
 /* Parallelism. run_fn calls task_fn(arg, index, worker) once for every index in 0..count-1, in any order, and returns
    when all are done. `worker` is 0..dist_context_desc.workers-1 and no two calls with one worker overlap.
    Fastest: each worker takes the next index when it is done with one; costs differ, and the largest come first where
-   they are known. task_fn never calls back into run_fn. Tried on 64 indices when the context is made; leaving one out,
-   doing it twice and a worker out of range are refused. NULL: OpenMP when the compiler has it on, else serial. */
+   they are known. task_fn never calls back into run_fn; 64 KiB of stack are enough for it, your callbacks apart. Tried
+   on 64 indices when the context is made; leaving one out, doing it twice and a worker out of range are refused. NULL:
+   OpenMP when the compiler has it on, else serial. */
 typedef void (*dist_task_fn)(void *arg, int index, int worker);
 typedef struct dist_scheduler {
     void *user;
@@ -1314,7 +1315,7 @@ static dist_status disti_limits(dist_context *ctx, const char *function, size_t 
         memcpy(text, function, n);
         memcpy(text + n, ": ", 2);
         memcpy(text + n + 2, limits->name, strlen(limits->name) + 1);
-        return disti_fail(ctx, DIST_BAD_ARGUMENT,
+        return disti_fail(ctx, disti_finite_double(x) ? DIST_BAD_ARGUMENT : DIST_NOT_FINITE,
                           limits->high > 1e38  ? "%s is %d, must be finite, 0 or positive"
                           : limits->low > 0.0 ? "%s is %d, must be 1 to %d"
                                               : "%s is %d, must be 0 to %d",
@@ -4230,12 +4231,13 @@ static dist_status disti_field_check(dist_context *ctx, const dist_field *field,
                             function);
     /* beyond these squares of lengths do not fit a float, and a surface would be missed without a word */
     if (!disti_finite(field->radius) || field->radius < DISTI_RADIUS_LEAST || field->radius > DISTI_RADIUS_MOST)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.radius is %d, must be 1e-15 to 1e15", function,
-                          (double)field->radius, 0);
+        return disti_fail(ctx, disti_finite(field->radius) ? DIST_BAD_ARGUMENT : DIST_NOT_FINITE,
+                          "%s: field.radius is %d, must be 1e-15 to 1e15", function, (double)field->radius, 0);
     for (int i = 0; i < 3; i++)
         if (!disti_finite(field->center[i]) || fabsf(field->center[i]) > DISTI_RADIUS_MOST)
-            return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.center[%d] is %d, must be within 1e15 of 0", function,
-                              i, (double)field->center[i]);
+            return disti_fail(ctx, disti_finite(field->center[i]) ? DIST_BAD_ARGUMENT : DIST_NOT_FINITE,
+                              "%s: field.center[%d] is %d, must be within 1e15 of 0", function, i,
+                              (double)field->center[i]);
     const disti_limit limits[] = {
         {"field.lipschitz", (double)field->lipschitz, 0, 3e38},
         {"field.lipschitz_within", (double)field->lipschitz_within, 0, 3e38},
@@ -4558,7 +4560,8 @@ static dist_status disti_gradients_check(dist_context *ctx, const dist_field *fi
         return disti_fail(ctx, DIST_UNSUPPORTED, "%s: grads.weights is given, but the field has no weights_fn",
                           function, 0, 0);
     if (grads->color_code && (field->color_code_size <= 0 || !field->color_adjoint_fn))
-        return disti_refuse(ctx, "%s: grads.color_code is given, but the field has no color code", function);
+        return disti_refuse(ctx, "%s: grads.color_code is given, but the field has no color code or color_adjoint_fn",
+                            function);
     if (grads->color_weights && (field->color_weight_count == 0 || !field->color_weights_fn))
         return disti_fail(ctx, DIST_UNSUPPORTED, "%s: grads.color_weights is given, but the field has no texture",
                           function, 0, 0);
@@ -5228,12 +5231,18 @@ static dist_status disti_scene_place(dist_scene *scene, int k, const dist_instan
                     next.field.color_code_size != placed->field.color_code_size))
         return disti_refuse(ctx, "%s: what the instance has of color must stay what it was", function);
     if (disti_scene_within(scene, &next.field)) return disti_refuse(ctx, "%s: the field is this scene's own", function);
-    if (!disti_finite(s->scale) || s->scale < 0.0f)
+    for (int i = 0; i < 13; i++) {
+        float value = i == 0 ? s->scale : i < 10 ? s->rotation[i - 1] : s->translation[i - 10];
+        if (!disti_finite(value))
+            return disti_fail(ctx, DIST_NOT_FINITE,
+                              i == 0   ? "%s: placement.scale is %d, must be finite"
+                              : i < 10 ? "%s: a number of placement.rotation is %d, must be finite"
+                                       : "%s: a number of placement.translation is %d, must be finite",
+                              function, (double)value, 0);
+    }
+    if (s->scale < 0.0f)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: placement.scale is %d, must be above 0 (0: 1)", function,
                           (double)s->scale, 0);
-    if (!disti_finite_all(9, s->rotation) || !disti_finite_all(3, s->translation))
-        return disti_fail(ctx, DIST_NOT_FINITE, "%s: placement.rotation and translation must be finite", function, 0,
-                          0);
     for (int i = 0; i < 9; i++) {
         m[i] = (double)s->rotation[i];
         square += m[i] * m[i];
@@ -5274,9 +5283,9 @@ static dist_status disti_scene_place(dist_scene *scene, int k, const dist_instan
 DIST_API dist_status dist_scene_set(dist_scene *scene, int index, const dist_instance *instance)
 {
     if (!scene) return DIST_BAD_ARGUMENT;
-    if (!instance || index < 0 || index >= scene->count)
-        return disti_fail(scene->ctx, DIST_BAD_ARGUMENT,
-                          "dist_scene_set: index is %d, must be 0 to %d; instance must not be NULL", NULL, index,
+    if (!instance) return disti_refuse(scene->ctx, "dist_scene_set: instance is NULL", NULL);
+    if (index < 0 || index >= scene->count)
+        return disti_fail(scene->ctx, DIST_BAD_ARGUMENT, "dist_scene_set: index is %d, must be 0 to %d", NULL, index,
                           scene->count - 1);
     return disti_scene_place(scene, index, instance, 0, "dist_scene_set");
 }
@@ -5310,8 +5319,12 @@ DIST_API dist_scene *dist_scene_create(dist_context *ctx, int count, const dist_
 {
     const char *name = "dist_scene_create";
     if (disti_enter(ctx) != DIST_OK) return NULL;
-    if (count < 1 || count > 1 << 20 || !instances) {
-        disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: count is %d, must be 1 to 2^20; instances not NULL", name, count, 0);
+    if (!instances) {
+        disti_refuse(ctx, "%s: instances is NULL", name);
+        return NULL;
+    }
+    if (count < 1 || count > 1 << 20) {
+        disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: count is %d, must be 1 to 1048576", name, count, 0);
         return NULL;
     }
     dist_scene *scene = (dist_scene *)disti_alloc(ctx, sizeof(dist_scene));
@@ -8767,14 +8780,17 @@ static dist_status disti_loader_channels(disti_loader *loader)
     const char *s = disti_archive_meta(&loader->archive, "dist.channels");
     if (!s) s = "sdf";
     while (net->channels < DISTI_MAX_CHANNELS) {
-        size_t n = strcspn(s, ",");
+        s += strspn(s, " ");
+        size_t whole = strcspn(s, ","), n = whole;
+        while (n > 0 && s[n - 1] == ' ') n--;
         if (n == 0 || n >= sizeof net->channel_names[0]) break;
-        memcpy(net->channel_names[net->channels], s, n);
-        if (n == 3 && memcmp(s, "sdf", 3) == 0 && net->sdf_channel < 0) net->sdf_channel = net->channels;
-        if (n == 1 && strncmp(s, "r,g,b", 5) == 0 && (s[5] == 0 || s[5] == ','))
-            net->color_channel = net->channels;
-        net->channels++;
-        s += n;
+        int c = net->channels++;
+        char(*names)[8] = net->channel_names;
+        memcpy(names[c], s, n);
+        if (strcmp(names[c], "sdf") == 0 && net->sdf_channel < 0) net->sdf_channel = c;
+        if (c >= 2 && strcmp(names[c - 2], "r") == 0 && strcmp(names[c - 1], "g") == 0 && strcmp(names[c], "b") == 0)
+            net->color_channel = c - 2;
+        s += whole;
         if (!*s) return DIST_OK;
         s++;
     }
@@ -9288,7 +9304,7 @@ static dist_status disti_net_desc_check(dist_context *ctx, const dist_net_desc *
     const float value[3] = {d->scale, d->bound, d->clamp};
     for (int i = 0; i < 3; i++) /* what a file may say */
         if (!disti_finite(value[i]) || value[i] < (i < 2 ? 1e-6f : 0.0f) || value[i] > 1e6f)
-            return disti_fail(ctx, DIST_BAD_ARGUMENT,
+            return disti_fail(ctx, disti_finite(value[i]) ? DIST_BAD_ARGUMENT : DIST_NOT_FINITE,
                               i == 0   ? "dist_net_create: scale is %d, must be 1e-6 to 1e6, or 0"
                               : i == 1 ? "dist_net_create: bound is %d, must be 1e-6 to 1e6, or 0"
                                        : "dist_net_create: clamp is %d, must be 0 to 1e6",
@@ -11206,13 +11222,14 @@ static dist_status disti_cache_make(dist_cache *cache, const dist_field *field, 
     return DIST_OK;
 }
 
-static dist_status disti_cache_take(dist_context *ctx, int resolution, const char *function, dist_cache *cache)
+/* format: of a sentence on the resolution. */
+static dist_status disti_cache_take(dist_context *ctx, int resolution, const char *format, const char *function,
+                                    dist_cache *cache)
 {
     memset(cache, 0, sizeof *cache);
     cache->ctx = ctx;
     if (resolution < 0 || resolution > 512 || resolution % DISTI_BRICK)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: resolution is %d, must be a multiple of 8 to 512 (0: 64)",
-                          function, resolution, 0);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, format, function, resolution, 0);
     cache->resolution = resolution ? resolution : 64;
     size_t n = (size_t)cache->resolution;
     cache->at = (unsigned char *)disti_alloc(ctx, n * n * n);
@@ -11225,7 +11242,8 @@ DIST_API dist_cache *dist_cache_create(dist_context *ctx, const dist_field *fiel
     if (disti_enter(ctx) != DIST_OK) return NULL;
     dist_cache *cache = (dist_cache *)disti_alloc(ctx, sizeof *cache);
     if (!cache) return NULL;
-    dist_status status = disti_cache_take(ctx, resolution, name, cache);
+    dist_status status = disti_cache_take(
+        ctx, resolution, "%s: resolution is %d, must be a multiple of 8 to 512 (0: 64)", name, cache);
     if (status == DIST_OK) status = disti_cache_make(cache, field, name);
     if (status == DIST_OK) return cache;
     dist_cache_destroy(cache);
@@ -16910,7 +16928,7 @@ typedef struct disti_ply_element {
 } disti_ply_element;
 
 typedef struct disti_ply {
-    int ascii, element_count, property_count;
+    int has_format, ascii, element_count, property_count;
     disti_ply_element elements[DISTI_PLY_ELEMENTS];
     disti_ply_property properties[DISTI_PLY_PROPERTIES];
 } disti_ply;
@@ -16982,8 +17000,9 @@ static int disti_ply_header(disti_mesh_text *r, disti_ply *ply)
     for (disti_skip_line(t); t->at < t->end; disti_skip_line(t)) {
         if (disti_ply_word(t, "end_header")) {
             disti_skip_line(t);
-            return 1;
+            return ply->has_format ? 1 : disti_mesh_fail(r, DIST_BAD_FILE, "the PLY header has no format", 0);
         } else if (disti_ply_word(t, "format")) {
+            ply->has_format = 1;
             ply->ascii = disti_ply_word(t, "ascii");
             if (!ply->ascii && !disti_ply_word(t, "binary_little_endian"))
                 return disti_mesh_fail(r, DIST_UNSUPPORTED, "PLY must be ascii or binary_little_endian", 0);
@@ -17358,7 +17377,8 @@ DIST_API size_t dist_workspace_bytes(const dist_workspace_desc *desc)
     }
     if (status == DIST_OK && d.cache) {
         disti_alloc(&ctx, sizeof cache);
-        status = disti_cache_take(&ctx, d.cache, name, &cache);
+        status = disti_cache_take(
+            &ctx, d.cache, "%s: cache is %d, must be a multiple of 8 to 512 (0: none)", name, &cache);
     }
     return status == DIST_OK && m.bytes != (size_t)-1 ? m.bytes : 0;
 }

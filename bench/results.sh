@@ -137,7 +137,7 @@ else
 fi
 assemble
 
-# Every sweep at every size, one scene on each of two cores. The defaults stay in one table, a
+# Every sweep at every size, one scene on each core. The defaults stay in one table, a
 # scene's sweeps get their own: in all too large for a file. A plot of each scene and size is in build/work_precision;
 # some are shown.
 sweep() {
@@ -152,6 +152,7 @@ rm -rf build/work_precision
 mkdir -p build/work_precision || exit 1
 table_size=128
 at_once=1
+cores=$(nproc 2>/dev/null || getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1)
 shown="torus_grazing_128 rods_1e-3_128 embedded_5_128 mug_128 fox_512"
 how=
 # make results HAVE=FILE: rows of an earlier run of this sweep, under a line of their origin
@@ -163,9 +164,9 @@ if [ -n "$quick" ]; then
     table_size=64
     shown="embedded_5_64"
     how="--quick --case embedded_5 --largest 128 --window 64 --seconds 0.1"
-elif [ "$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1)" -ge 2 ]; then
-    at_once=2
-    DIST_ORIGIN="$DIST_ORIGIN; another scene on the other core"
+elif [ "$cores" -ge 2 ]; then
+    at_once=$cores
+    DIST_ORIGIN="$DIST_ORIGIN; as many scenes at a time"
 fi
 csv work_precision sweep $how --at-once $at_once && {
     rm -f "$folder"/work_precision_*.csv

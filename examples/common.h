@@ -351,19 +351,20 @@ typedef struct rng {
     unsigned long long state;
 } rng;
 
-static inline rng rng_begin(unsigned long long seed)
-{
-    rng r;
-    r.state = seed * 0x9e3779b97f4a7c15ULL + 0x1234567ULL;
-    return r;
-}
-
 static inline unsigned long long rng_next(rng *r)
 {
     unsigned long long x = r->state += 0x9e3779b97f4a7c15ULL;
     x = (x ^ (x >> 30)) * 0xbf58476d1ce4e5b9ULL;
     x = (x ^ (x >> 27)) * 0x94d049bb133111ebULL;
     return x ^ (x >> 31);
+}
+
+static inline rng rng_begin(unsigned long long seed)
+{
+    rng r;
+    r.state = seed;
+    r.state = rng_next(&r); /* else a seed's numbers are another's, some draws later */
+    return r;
 }
 
 /* Uniform in [0, 1). */

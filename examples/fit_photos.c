@@ -757,7 +757,6 @@ static request read_options(int argc, char **argv)
     if (!(r.place[0] > 0)) { fail("--place needs a scale above 0"); }
     if (!r.model) { r.model = "embedded"; }
     if (!r.texture) { r.texture = strcmp(r.model, "embedded") == 0 ? "embedded" : "waves"; }
-    if (!r.target) { r.target = "0"; }
     check_stem(r.out);
     return r;
 }

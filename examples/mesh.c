@@ -44,7 +44,8 @@ int main(int argc, char **argv)
         }
     }
     if (!model) { fail("which model? mesh MODEL --out FILE.ply; --help tells more"); }
-    if (!path || !(path_ends_with(path, ".ply") || path_ends_with(path, ".obj"))) {
+    if (!path || !(path_ends_with(path, ".ply") || path_ends_with(path, ".PLY") || path_ends_with(path, ".obj") ||
+                   path_ends_with(path, ".OBJ"))) {
         fail("--out FILE.ply or --out FILE.obj is needed%s%s", path ? ", got " : "", path ? path : "");
     }
 

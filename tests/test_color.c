@@ -795,7 +795,10 @@ TEST(a_texture_that_does_not_fit_and_gradients_that_are_not_there_are_refused)
     grads = gradients_of(&s, g);
     s.field.color_adjoint_fn = NULL;
     dist_tape *tape = pictures_take(&a, &s);
-    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_render_backward(s.ctx, tape, &a.d_out, &grads), s.ctx); /* grads.color_code */
+    dist_context_clear(s.ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_render_backward(s.ctx, tape, &a.d_out, &grads), s.ctx);
+    CHECK_TEXT("grads.color_code is given, but the field has no color code or color_adjoint_fn",
+               dist_context_message(s.ctx));
     grads.color_code = NULL;
     CHECK_STATUS(DIST_UNSUPPORTED, dist_render_backward(s.ctx, tape, &a.d_out, &grads), s.ctx);
     dist_tape_destroy(tape);

@@ -416,6 +416,7 @@ TEST(mesh_files_that_mean_harm_are_refused_with_a_sentence)
         "just text",
         "v 0 0 0\nf 1 1 4294967297\n",
         PLY "element vertex 1\n" XYZ,
+        "ply\nelement vertex 1\n" XYZ "end_header\n0 0 0\n",
         PLY "element vertex 1\n" XYZ "end_header\n0 0\n",
         PLY "element vertex 1\nproperty float x\nend_header\n0\n",
         PLY "element vertex -1\n" XYZ "end_header\n",

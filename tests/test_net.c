@@ -1009,6 +1009,28 @@ TEST(channels_that_end_the_header_are_read_no_further)
     }
 }
 
+TEST(spaces_around_the_channels_names_are_none_of_theirs)
+{
+    static const char *const metas[] = {"\"dist.channels\":\"sdf,r,g,b\"", "\"dist.channels\":\" sdf , r,g ,b  \""};
+    for (int k = 0; k < 2; k++) {
+        dist_context *ctx = test_context();
+        size_t size;
+        unsigned char *bytes = file_of(metas[k], "lin0.weight 4 5;lin0.bias 4;lin1.weight 4 4;lin1.bias 4;", "F32", -1,
+                                       0.0f, &size);
+        dist_net *net = dist_net_load(ctx, bytes, size);
+        CHECK_STATUS(DIST_OK, dist_context_status(ctx), ctx);
+        dist_shape *shape = dist_shape_create(ctx, net, NULL);
+        dist_field field = dist_shape_field(shape);
+        CHECK_EQUAL(4, dist_net_channels(net));
+        CHECK(field.eval_fn != NULL && field.color_fn != NULL);
+        free(bytes);
+        dist_shape_destroy(shape);
+        dist_net_destroy(net);
+        dist_context_destroy(ctx);
+    }
+    REFUSED(DIST_BAD_FILE, "dist.channels", "\"dist.channels\":\"sdf, ,r\"", good_tensors);
+}
+
 /* 1e-6, the least that a bound and a scale may be, is no float: it is written as a number somewhat below. */
 TEST(the_least_numbers_a_file_may_say_are_floats)
 {
@@ -1524,6 +1546,7 @@ int main(int argc, char **argv)
     RUN(numbers_that_are_not_finite_are_refused_and_change_nothing);
     RUN(the_file_that_the_wrong_ones_are_made_of_is_right);
     RUN(channels_that_end_the_header_are_read_no_further);
+    RUN(spaces_around_the_channels_names_are_none_of_theirs);
     RUN(the_least_numbers_a_file_may_say_are_floats);
     RUN(tensors_that_do_not_fit_are_refused_with_a_sentence);
     RUN(a_layer_missing_in_the_middle_is_refused);

@@ -1036,14 +1036,19 @@ TEST(render_refuses_null_and_garbage_with_a_sentence)
         CHECK_TEXT(part, dist_context_message(ctx));
         CHECK_EQUAL(0x5a, a.mask[0]);
     }
-    for (int k = 0; k < 2; k++) {
+    for (int k = 0; k < 7; k++) {
         dist_field field = shape_field(&shape, 1, 1);
         dist_render_desc how = plain_how();
         dist_images out = all_planes(&a);
-        memcpy(k ? &how.background_color[2] : &how.background, &nan, sizeof nan);
+        static const char *const sentences[7] = {
+            "how.background is nan", "how.background_color[2] is nan", "field.radius is nan", "field.center[1] is nan",
+            "field.lipschitz is nan", "how.epsilon is nan", "how.normal_delta is nan"};
+        float *const places[7] = {&how.background, &how.background_color[2], &field.radius, &field.center[1],
+                                  &field.lipschitz, &how.epsilon, &how.normal_delta};
+        memcpy(places[k], &nan, sizeof nan);
         dist_context_clear(ctx);
         CHECK_STATUS(DIST_NOT_FINITE, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
-        CHECK_TEXT(k ? "how.background_color[2] is nan" : "how.background is nan", dist_context_message(ctx));
+        CHECK_TEXT(sentences[k], dist_context_message(ctx));
         CHECK_EQUAL(0x5a, a.mask[0]);
     }
     CHECK_EQUAL(DIST_BAD_ARGUMENT, dist_render(NULL, NULL, NULL, NULL, NULL, NULL));

@@ -1014,7 +1014,8 @@ TEST(sizes_below_zero_are_refused_and_a_plate_of_no_thickness_is_not)
     wrong[2] = dist_field_box(box);
     wrong[3] = dist_field_sphere(none);
     for (int i = 0; i < 4; i++) {
-        CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_eval(ctx, &wrong[i], 1, p, &f, NULL), ctx);
+        dist_status status = dist_field_eval(ctx, &wrong[i], 1, p, &f, NULL);
+        CHECK_STATUS(i == 3 ? DIST_NOT_FINITE : DIST_BAD_ARGUMENT, status, ctx);
         if (i == 2) CHECK_TEXT("field.radius is -0.3, must be", dist_context_message(ctx));
         dist_context_clear(ctx);
     }
@@ -1073,9 +1074,10 @@ TEST(scenes_refuse_what_cannot_be_placed)
     good.field = &field;
     CHECK(dist_scene_create(NULL, 1, &good) == NULL);
     CHECK(dist_scene_create(ctx, 0, &good) == NULL);
+    CHECK_TEXT("count is 0, must be 1 to", dist_context_message(ctx));
     dist_context_clear(ctx);
     CHECK(dist_scene_create(ctx, 1, NULL) == NULL);
-    CHECK_TEXT("count is 1", dist_context_message(ctx));
+    CHECK_TEXT("instances is NULL", dist_context_message(ctx));
     dist_context_clear(ctx);
     x = good;
     x.field = NULL;
@@ -1103,10 +1105,14 @@ TEST(scenes_refuse_what_cannot_be_placed)
     x.placement.rotation[0] = x.placement.rotation[4] = 1;
     x.placement.rotation[8] = -1; /* a mirror */
     refused(ctx, &x, "determinant -1");
-    uint32_t bits = 0x7fc00000u;
-    x = good;
-    memcpy(&x.placement.translation[1], &bits, sizeof bits);
-    refused(ctx, &x, "must be finite");
+    static const char *const numbers[3] = {"placement.scale is", "placement.rotation is", "placement.translation is"};
+    for (int i = 0; i < 6; i++) {
+        const uint32_t bits[2] = {0x7fc00000u, 0x7f800000u};
+        x = good;
+        float *const places[3] = {&x.placement.scale, &x.placement.rotation[3], &x.placement.translation[1]};
+        memcpy(places[i / 2], &bits[i % 2], sizeof bits[0]);
+        refused(ctx, &x, numbers[i / 2]);
+    }
     x = good;
     x.placement.translation[1] = -1e30f;
     refused(ctx, &x, "at -1e30 on axis 1; must be within 1e15");

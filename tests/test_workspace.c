@@ -304,6 +304,8 @@ TEST(what_cannot_be_made_has_no_bytes_and_a_sentence)
     check_refused(&d, &h, DIST_BAD_ARGUMENT, "a texture is given, but net and model are NULL");
     d = good, d.texture = file, d.texture_size = size;
     check_refused(&d, &h, DIST_UNSUPPORTED, "no channels r,g,b");
+    d = good, d.cache = 12;
+    check_refused(&d, &h, DIST_BAD_ARGUMENT, "cache is 12, must be a multiple of 8 to 512 (0: none)");
     d = good, camera.width = 0;
     check_refused(&d, &h, DIST_BAD_ARGUMENT, "camera is 0 x 9");
     camera.width = 9, how.samples = 9;

@@ -384,7 +384,7 @@ DIST_API dist_status dist_net_save(dist_context *ctx, const dist_net *net, void 
 
 enum {
     DIST_HALF_OFF = 0,
-    DIST_HALF_AUTO, /* F16 where the processor has it and the weights fit, else BF16 */
+    DIST_HALF_AUTO, /* F16 where the processor has it, else BF16: Intel's with both take longer in that than in f32 */
     DIST_HALF_F16,  /* AVX512-FP16: 11 bits of mantissa, up to 65504 */
     DIST_HALF_BF16  /* AVX512-BF16: 8 bits */
 };
@@ -1315,7 +1315,7 @@ static dist_status disti_limits(dist_context *ctx, const char *function, size_t 
         memcpy(text, function, n);
         memcpy(text + n, ": ", 2);
         memcpy(text + n + 2, limits->name, strlen(limits->name) + 1);
-        return disti_fail(ctx, disti_finite_double(x) ? DIST_BAD_ARGUMENT : DIST_NOT_FINITE,
+        return disti_fail(ctx, DIST_BAD_ARGUMENT,
                           limits->high > 1e38  ? "%s is %d, must be finite, 0 or positive"
                           : limits->low > 0.0 ? "%s is %d, must be 1 to %d"
                                               : "%s is %d, must be 0 to %d",
@@ -4231,13 +4231,12 @@ static dist_status disti_field_check(dist_context *ctx, const dist_field *field,
                             function);
     /* beyond these squares of lengths do not fit a float, and a surface would be missed without a word */
     if (!disti_finite(field->radius) || field->radius < DISTI_RADIUS_LEAST || field->radius > DISTI_RADIUS_MOST)
-        return disti_fail(ctx, disti_finite(field->radius) ? DIST_BAD_ARGUMENT : DIST_NOT_FINITE,
-                          "%s: field.radius is %d, must be 1e-15 to 1e15", function, (double)field->radius, 0);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.radius is %d, must be 1e-15 to 1e15", function,
+                          (double)field->radius, 0);
     for (int i = 0; i < 3; i++)
         if (!disti_finite(field->center[i]) || fabsf(field->center[i]) > DISTI_RADIUS_MOST)
-            return disti_fail(ctx, disti_finite(field->center[i]) ? DIST_BAD_ARGUMENT : DIST_NOT_FINITE,
-                              "%s: field.center[%d] is %d, must be within 1e15 of 0", function, i,
-                              (double)field->center[i]);
+            return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.center[%d] is %d, must be within 1e15 of 0", function,
+                              i, (double)field->center[i]);
     const disti_limit limits[] = {
         {"field.lipschitz", (double)field->lipschitz, 0, 3e38},
         {"field.lipschitz_within", (double)field->lipschitz_within, 0, 3e38},
@@ -8625,8 +8624,7 @@ DIST_API dist_status dist_net_set_half(dist_context *ctx, dist_net *net, int kin
     if (kind < DIST_HALF_OFF || kind > DIST_HALF_BF16)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: kind is %d, must be a DIST_HALF_ constant", name, kind, 0);
     float largest = disti_half_largest(net);
-    if (kind == DIST_HALF_AUTO)
-        kind = disti_cpu_half(DIST_HALF_F16) && largest <= 65504.0f ? DIST_HALF_F16 : DIST_HALF_BF16;
+    if (kind == DIST_HALF_AUTO) kind = disti_cpu_half(DIST_HALF_F16) ? DIST_HALF_F16 : DIST_HALF_BF16;
     if (kind != DIST_HALF_OFF && !disti_cpu_half(kind))
         return disti_fail(ctx, DIST_UNSUPPORTED, "dist_net_set_half: this processor or this build has no %s arithmetic",
                           kind == DIST_HALF_F16 ? "f16" : "bf16", 0, 0);
@@ -9304,7 +9302,7 @@ static dist_status disti_net_desc_check(dist_context *ctx, const dist_net_desc *
     const float value[3] = {d->scale, d->bound, d->clamp};
     for (int i = 0; i < 3; i++) /* what a file may say */
         if (!disti_finite(value[i]) || value[i] < (i < 2 ? 1e-6f : 0.0f) || value[i] > 1e6f)
-            return disti_fail(ctx, disti_finite(value[i]) ? DIST_BAD_ARGUMENT : DIST_NOT_FINITE,
+            return disti_fail(ctx, DIST_BAD_ARGUMENT,
                               i == 0   ? "dist_net_create: scale is %d, must be 1e-6 to 1e6, or 0"
                               : i == 1 ? "dist_net_create: bound is %d, must be 1e-6 to 1e6, or 0"
                                        : "dist_net_create: clamp is %d, must be 0 to 1e6",

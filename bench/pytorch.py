@@ -262,7 +262,9 @@ def main():
     parser.add_argument("--case", choices=CASES, help="only this one")
     parser.add_argument("--size", type=int, default=512, help="pixels along a side (default 512)")
     parser.add_argument("--steps", type=int, default=5, help="measured steps (default 5)")
-    parser.add_argument("--threads", type=int, default=os.cpu_count(), help="for both (default all)")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    parser.add_argument("--threads", type=int, default=cores,
+                        help="for both (default: as many as the process may use)")
     parser.add_argument("--no-compile", action="store_true", help="without the compiled row")
     parser.add_argument("--no-gpu", action="store_true", help="without the GPU's rows")
     o = parser.parse_args()

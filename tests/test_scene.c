@@ -1014,8 +1014,7 @@ TEST(sizes_below_zero_are_refused_and_a_plate_of_no_thickness_is_not)
     wrong[2] = dist_field_box(box);
     wrong[3] = dist_field_sphere(none);
     for (int i = 0; i < 4; i++) {
-        dist_status status = dist_field_eval(ctx, &wrong[i], 1, p, &f, NULL);
-        CHECK_STATUS(i == 3 ? DIST_NOT_FINITE : DIST_BAD_ARGUMENT, status, ctx);
+        CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_eval(ctx, &wrong[i], 1, p, &f, NULL), ctx);
         if (i == 2) CHECK_TEXT("field.radius is -0.3, must be", dist_context_message(ctx));
         dist_context_clear(ctx);
     }

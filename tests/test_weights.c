@@ -85,7 +85,7 @@ static void train(const training *how)
     desc.scale = how->scale;
     desc.output_linear = 1;
     desc.geometric = how->activation != DIST_ACTIVATION_SINE;
-    desc.seed = 3;
+    desc.seed = 8;
     dist_net *net = dist_net_create(ctx, &desc);
     dist_shape *shape = dist_shape_create(ctx, net, NULL);
     dist_field field = dist_shape_field(shape);

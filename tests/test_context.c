@@ -656,7 +656,7 @@ static unsigned state_get(void)
 
 #ifdef OWN_STACKS
 /* A scheduler whose tasks run on a stack of its own, which tells how much of it they used. */
-enum { STACK = 1 << 20, MARK = 0xa5 };
+enum { STACK = 1 << 17, MARK = 0xa5 };
 typedef struct stack_run {
     dist_task_fn task_fn;
     void *arg;

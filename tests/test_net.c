@@ -711,12 +711,8 @@ static double sphere_mean(dist_context *ctx, const dist_field *field, double r, 
     double mean = 0.0;
     test_random random = test_random_seed(1);
     for (int i = 0; i < N; i++) {
-        float *p = points + 3 * i, length = 0.0f;
-        while (!(length > 0.1f && length < 1.0f)) {
-            test_random_fill(&random, 3, p, -1.0f, 1.0f);
-            length = sqrtf(p[0] * p[0] + p[1] * p[1] + p[2] * p[2]);
-        }
-        for (int k = 0; k < 3; k++) p[k] *= (float)r / length;
+        test_random_direction(&random, points + 3 * i);
+        for (int k = 0; k < 3; k++) points[3 * i + k] *= (float)r;
     }
     CHECK_STATUS(DIST_OK, dist_field_eval(ctx, field, N, points, sdf, NULL), ctx);
     for (int i = 0; i < N; i++) mean += (double)sdf[i] / N;

@@ -781,8 +781,8 @@ typedef struct dist_adam {
     float epsilon; /* 0: 1e-8 */
     int step;      /* steps taken so far */
 } dist_adam;
-/* x (n) moves against gradient (n). A gradient or moment that is not finite leaves its number and moments as they
-   were; returns how many did: n, all of them, where x, gradient or adam->moments is NULL or the rate is not finite. */
+/* x (n) moves against gradient (n). A number that is not finite, or whose gradient or moment is not, stays as it was,
+   its moments too; returns how many did: n, all, where x, gradient or adam->moments is NULL or the rate not finite. */
 DIST_API size_t dist_adam_step(dist_adam *adam, size_t n, float *x, const float *gradient);
 #endif
 
@@ -15697,7 +15697,7 @@ DIST_API size_t dist_adam_step(dist_adam *adam, size_t n, float *x, const float 
     float *second = adam->moments + n;
     for (size_t i = 0; i < n; i++) {
         double g = (double)gradient[i];
-        if (!disti_finite(gradient[i]) || !disti_finite(first[i]) || !disti_finite(second[i])) {
+        if (!disti_finite(x[i]) || !disti_finite(gradient[i]) || !disti_finite(first[i]) || !disti_finite(second[i])) {
             skipped++;
             continue;
         }
@@ -15706,7 +15706,7 @@ DIST_API size_t dist_adam_step(dist_adam *adam, size_t n, float *x, const float 
         first[i] = (float)m;
         second[i] = (float)root;
         double step = rate * (m / correction1) / (root / correction2 + epsilon);
-        if (rate > 0.0 && disti_finite(x[i])) x[i] = disti_within_float((double)x[i] - step);
+        if (rate > 0.0) x[i] = disti_within_float((double)x[i] - step);
     }
     return skipped;
 }

@@ -289,7 +289,7 @@ TEST(numbers_at_the_end_of_the_range_stay_in_it)
     CHECK(test_finite((double)dist_loss_normal(1, normal, target, NULL, 1e30f, NULL)));
 }
 
-TEST(adam_skips_and_counts_gradients_that_are_not_finite)
+TEST(adam_skips_and_counts_what_is_not_finite)
 {
     float x[3] = {1, 2, 3}, g[3] = {0, 0, 1}, moments[6] = {0.5f, 0.25f, 0, 0.5f, 0.25f, 0};
     dist_adam adam;
@@ -309,6 +309,12 @@ TEST(adam_skips_and_counts_gradients_that_are_not_finite)
     CHECK_NEAR(1, x[0], 0);
     CHECK_NEAR(1, x[1], 0);
     CHECK(x[2] < 1 && x[2] > 0);
+    memset(moments, 0, sizeof moments);
+    x[1] = loss_bits(0x7fc00000u); /* a code that is lost already */
+    CHECK_EQUAL(1, dist_adam_step(&adam, 3, x, g));
+    CHECK(!test_finite((double)x[1]) && x[0] < 1);
+    CHECK_NEAR(0, moments[1], 0);
+    CHECK_NEAR(0, moments[4], 0);
 }
 
 TEST(adam_without_its_arrays_says_that_nothing_moved)
@@ -354,7 +360,7 @@ int main(int argc, char **argv)
     RUN(adam_with_a_rate_that_is_not_finite_never_moves);
     RUN(adam_stays_finite_for_huge_and_tiny_gradients);
     RUN(numbers_at_the_end_of_the_range_stay_in_it);
-    RUN(adam_skips_and_counts_gradients_that_are_not_finite);
+    RUN(adam_skips_and_counts_what_is_not_finite);
     RUN(adam_without_its_arrays_says_that_nothing_moved);
     RUN(adam_with_a_negative_rate_moves_nothing);
     return test_report();

@@ -336,7 +336,8 @@ typedef struct dist_scene dist_scene;
 DIST_API dist_scene *dist_scene_create(dist_context *ctx, int count, const dist_instance *instances);
 DIST_API void dist_scene_destroy(dist_scene *scene);
 /* Moves an instance or replaces its field (NULL: it stays) by one whose code is as long and that has a color if the old
-   one had. No allocator call. Take dist_scene_field again afterwards: the bounding sphere changes. */
+   one had. No allocator call. Take dist_scene_field again afterwards, and set it in a scene that holds this one: the
+   bounding sphere changes. */
 DIST_API dist_status dist_scene_set(dist_scene *scene, int index, const dist_instance *instance);
 /* The scene as a field. Borrows the scene. No gradient for weights. Its code is, for each instance, its field's code
    (nothing if that has no adjoint), then its placement as dist_similarity_move has it: log-scale, w of
@@ -520,7 +521,8 @@ enum {
 
 /* `how` in comments and messages. */
 typedef struct dist_render_desc {
-    int max_steps;       /* queries per ray at most, to 60000; 0: 100 guarded, 10000 certified, 50 paper */
+    int max_steps; /* queries per ray at most, to 60000, and up to 40 more to where f has crossed 0 between two of them;
+                      0: 100 guarded, 10000 certified, 50 paper */
     float step_scale;    /* alpha, above 0, to 100; 0: 1.5 (paper: rows aggressive and coarse-to-fine) */
     float epsilon; /* largest |f| of a hit, shape units, which those interpolated between hits alike may exceed; 0: 5e-5
                       of the bounding radius or field.detail, or less where a pixel is smaller (paper: 5e-5). The
@@ -604,8 +606,9 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
                                 dist_stats *stats);
 
 /* The nearest point of the surface to each of n points, found from where |f| falls: steps along the gradient onto the
-   surface, then along the surface as long as that brings it nearer, then a look around for nearer parts. Exact for a
-   distance; else mostly the nearest, at the least a local nearest point.
+   surface, then along the surface as long as that brings it nearer, then a look around for nearer parts. Of a distance
+   as far off as the nearest to within 1e-4 of the radius, 1e-3 from a radius outside the bounding sphere on, where one
+   point in thousands also ends on a part that is not the nearest; else mostly the nearest, at the least a local one.
    closest (n, 3); distance (n) signed, below 0 inside, and status (n) may be NULL: DIST_RAY_HIT, DIST_RAY_UNRESOLVED
    (no surface found: the last point tried), DIST_RAY_NOT_FINITE. Nothing is asked outside the bounding sphere. */
 DIST_API dist_status dist_field_closest_point(dist_context *ctx, const dist_field *field, size_t n,
@@ -625,7 +628,7 @@ DIST_API dist_cache *dist_cache_create(dist_context *ctx, const dist_field *fiel
 DIST_API void dist_cache_destroy(dist_cache *cache);
 /* The field with its cache, to be traced instead of it. Borrows both. As soon as the shape's code, the net's weights or
    the scene have changed every call refuses it; a field of your own without changes_fn must not change. A cache serves
-   Lipschitz figures up to those it was made with: raise field.lipschitz before, not how.lipschitz for dist_trace. With
+   Lipschitz figures up to those it was made with: raise field.lipschitz, lipschitz_far before, not how.lipschitz. With
    how.certified it is used only where it was made with figures as large as field.certified and certified_far. */
 DIST_API dist_field dist_cache_field(const dist_cache *cache);
 /* Makes it anew for a field that has changed, or another one; then take dist_cache_field again. No allocator call. */
@@ -635,7 +638,7 @@ DIST_API unsigned long long dist_cache_queries(const dist_cache *cache);
 
 /* A sphere against a field. */
 typedef struct dist_contact {
-    float depth;     /* how far the sphere is in; below 0: they are at least so far apart */
+    float depth;     /* how far the sphere is in; below 0: they are at least so far apart, as far as that is exact */
     float normal[3]; /* unit, out of the field: moving the sphere by depth * normal ends the contact; 0 without one */
     float point[3];  /* of the surface, the deepest in the sphere */
     int status;      /* DIST_RAY_HIT: they touch; DIST_RAY_MISS; else as dist_field_closest_point */
@@ -9715,6 +9718,13 @@ static float disti_paper_alpha(const dist_render_desc *how)
 }
 #endif
 
+/* What the rounding of f, of numbers of the radius's size, and of points where the field stands may change f by. */
+static float disti_field_noise(const dist_field *field)
+{
+    const float *c = field->center;
+    return 5e-7f * field->radius + 1.2e-7f * disti_length(c[0], c[1], c[2]);
+}
+
 static dist_status disti_tracer_init(disti_tracer *tracer, dist_context *ctx, const dist_field *field,
                                      const dist_render_desc *desc, const char *function)
 {
@@ -9745,7 +9755,7 @@ static dist_status disti_tracer_init(disti_tracer *tracer, dist_context *ctx, co
         }
         tracer->ratio = tracer->lipschitz / far;
     }
-    tracer->noise = 5e-7f * field->radius;
+    tracer->noise = disti_field_noise(field);
     tracer->epsilon = tracer->how.epsilon;
     if (field->clamp > 0.0f && tracer->how.trace == DIST_TRACE_GUARDED)
         tracer->epsilon = DISTI_MIN(tracer->epsilon, 0.5f * field->clamp); /* a clamped f is near nothing */
@@ -11094,8 +11104,8 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
     if (field->cache && tracer.how.lipschitz > most)
         return disti_fail(ctx, DIST_BAD_ARGUMENT,
                           "dist_trace: how.lipschitz is %d, must be at most the %d that field.cache was made with; "
-                          "raise field.lipschitz before dist_cache_create", NULL, (double)tracer.how.lipschitz,
-                          (double)most);
+                          "raise field.lipschitz and lipschitz_far before dist_cache_create", NULL,
+                          (double)tracer.how.lipschitz, (double)most);
     disti_stats_begin(ctx);
     disti_free_job job = {&tracer, n, origins, directions, hits};
     disti_run(ctx, (int)((n + DISTI_FREE_RAYS - 1) / DISTI_FREE_RAYS), disti_free_task, &job);
@@ -11295,10 +11305,12 @@ typedef struct disti_foot {
     float away;      /* of p from the bounding sphere; 0: within */
     float f, damping, share;
     float rest[3], relax; /* the last slide's, and by which share of it */
+    float from[3], drift[3]; /* of a pull: the nearest point before it, and by how much more it is to go on */
     float sign;
     float hope[3], hoped, before; /* of a look around: the nearest place foretold, how far; the distance at its start */
     unsigned char status, steps, slides, sides; /* sides: 1 a sample was outside, 2 inside */
     unsigned char look, looks; /* samples of this look around, 0: none; looks so far */
+    unsigned char pulled;      /* the last move was a pull */
 } disti_foot;
 
 enum { DISTI_FEET = 512, DISTI_FOOT_STEPS = 160, DISTI_FOOT_TURN = 48, DISTI_FOOT_SLIDES = 16 }; /* slides first */
@@ -11320,19 +11332,27 @@ static float disti_foot_move(const dist_field *field, float *x, const float *n, 
     return DISTI_MAX(length - field->radius, 0.0f);
 }
 
-/* Notes x, which is on the surface with the normal n, if it is the nearest so far, and by how much. */
+/* Notes x, which is on the surface with the normal n, if it is the nearest so far, and by how much: of p far away that
+   is less than a float's distances can tell, |p - best| - |p - x| = (x - best) . (2 p - x - best) / (their sum). */
 static float disti_foot_arrive(disti_foot *foot, const float *n)
 {
     float d[3];
-    for (int i = 0; i < 3; i++) d[i] = foot->p[i] - foot->x[i];
-    float distance = disti_foot_length(d), gain = foot->distance - distance;
-    if (gain > 0.0f || foot->status != DIST_RAY_HIT) {
+    double gain = 0.0;
+    for (int i = 0; i < 3; i++) {
+        double x = (double)foot->x[i], best = (double)foot->best[i];
+        d[i] = foot->p[i] - foot->x[i];
+        gain += (x - best) * (2.0 * (double)foot->p[i] - x - best);
+    }
+    float distance = disti_foot_length(d);
+    gain /= DISTI_MAX((double)foot->distance + (double)distance, 1e-300);
+    if (foot->status != DIST_RAY_HIT) gain = (double)(foot->distance - distance); /* the first */
+    if (gain > 0.0 || foot->status != DIST_RAY_HIT) {
         memcpy(foot->best, foot->x, sizeof foot->best);
         memcpy(foot->normal, n, sizeof foot->normal);
         foot->distance = distance;
     }
     foot->status = DIST_RAY_HIT;
-    return gain;
+    return disti_within_float(gain);
 }
 
 /* Slides toward where the plane at x across n, a distance `down` against it, is nearest to p: along the surface by a
@@ -11363,16 +11383,34 @@ static int disti_foot_slide(const dist_field *field, disti_foot *foot, const flo
     return 1;
 }
 
-/* From the nearest point so far a share of the way back to p. */
+/* From the nearest point so far a share of the way back to p, or to where that leaves the bounding sphere: from there
+   the surface is no nearer elsewhere, either. Of p far away that brings x on by little; then what a pull brought is
+   doubled in the next as long as x comes nearer, and quartered else. */
 static int disti_foot_pull(const dist_field *field, disti_foot *foot, float gain)
 {
     float d[3], r = field->radius, reach = field->clamp > 0.0f ? 0.5f * field->clamp : 2.0f * r;
-    if (gain < 1e-5f * r) foot->share *= 0.25f;
+    float way = foot->distance, along = 0.0f, square = 0.0f, drift = 0.0f;
+    for (int i = 0; i < 3; i++) {
+        float x = foot->best[i] - field->center[i];
+        d[i] = (foot->p[i] - foot->best[i]) / DISTI_MAX(way, 1e-30f);
+        along += x * d[i];
+        square += x * x;
+    }
+    way = DISTI_MIN(way, sqrtf(DISTI_MAX(along * along + r * r - square, 0.0f)) - along);
+    int far = foot->pulled && way < 0.5f * foot->distance;
+    for (int i = 0; i < 3; i++) {
+        float more = gain > 0.0f ? 2.0f * (foot->best[i] - foot->from[i]) : 0.25f * foot->drift[i];
+        foot->drift[i] = far ? more : 0.0f;
+        drift += foot->drift[i] * foot->drift[i];
+    }
+    if (!(drift > 1e-8f * r * r)) memset(foot->drift, 0, sizeof foot->drift);
+    if (gain < 1e-5f * r && !(drift > 1e-8f * r * r)) foot->share *= 0.25f;
     if (foot->share < 0.02f) return 0;
-    float share = DISTI_MIN(foot->share, reach / foot->distance);
-    for (int i = 0; i < 3; i++) d[i] = foot->p[i] - foot->best[i];
+    memcpy(foot->from, foot->best, sizeof foot->from);
     memcpy(foot->x, foot->best, sizeof foot->x);
-    disti_foot_move(field, foot->x, d, share);
+    disti_foot_move(field, foot->x, foot->drift, 1.0f);
+    disti_foot_move(field, foot->x, d, DISTI_MIN(foot->share * way, reach));
+    foot->pulled = 1;
     foot->damping = 1.0f;
     foot->f = 0.0f;
     return 1;
@@ -11389,6 +11427,7 @@ static int disti_foot_look(const dist_field *field, disti_foot *foot)
         if (vain || foot->looks == 3 || foot->steps + 24 > DISTI_FOOT_STEPS)
             return disti_foot_pull(field, foot, field->radius);
         foot->looks++;
+        foot->pulled = 0;
         foot->before = foot->distance;
         foot->hoped = 3e38f;
     } else if (foot->look == 12) {
@@ -11467,15 +11506,17 @@ static int disti_foot_advance(const dist_field *field, disti_foot *foot, float f
             return 0;
         }
     }
-    int on = size <= 2e-6f * field->radius * DISTI_MAX(slope, 0.25f);
+    int on = size <= (1.5e-6f * field->radius + disti_field_noise(field)) * DISTI_MAX(slope, 0.25f);
     float gain = on ? disti_foot_arrive(foot, n) : 0.0f;
-    if (on && foot->distance <= foot->least * 1.00002f + 2e-6f * field->radius) return 0;
+    float exact = 2e-5f * DISTI_MIN(foot->least, field->radius) + 2e-6f * field->radius;
+    if (on && foot->distance <= foot->least + exact) return 0;
     if (foot->steps >= DISTI_FOOT_STEPS) return 0;
     if (foot->steps < DISTI_FOOT_SLIDES && foot->status == DIST_RAY_HIT && slope > (on ? 0.1f : 0.5f) * lipschitz &&
         (on || size < 0.02f * field->radius)) {
         if (disti_foot_slide(field, foot, n, f / slope, on)) return 1;
-        float along = foot->distance * slope; /* about as far as f said at p, and f nearly a distance */
-        if (along <= 1.2f * foot->told && along >= 0.8f * foot->told && slope > 0.5f * lipschitz) return 0;
+        float along = foot->distance * slope; /* about as far as f said at p, and f nearly a distance; not slid off */
+        int nearest = gain > -1e-5f * field->radius;
+        if (nearest && along <= 1.2f * foot->told && along >= 0.8f * foot->told && slope > 0.5f * lipschitz) return 0;
     }
     if (on) {
         int tires = foot->looks == 0 && foot->steps >= DISTI_FOOT_TURN; /* in a crease pulls come to no end */

@@ -171,6 +171,129 @@ TEST(closest_points_of_distances_are_exact)
     dist_context_destroy(ctx);
 }
 
+/* The distance of a box with these half axes. */
+static double box_distance(const double half[3], const double p[3])
+{
+    double q[3], out[3];
+    for (int k = 0; k < 3; k++) {
+        q[k] = fabs(p[k]) - half[k];
+        out[k] = fmax(q[k], 0);
+    }
+    return shape_length(out[0], out[1], out[2]) + fmin(fmax(q[0], fmax(q[1], q[2])), 0);
+}
+
+static double torus_distance(double ring, double tube, const double p[3])
+{
+    return shape_length(shape_length(p[0], p[2], 0) - ring, p[1], 0) - tube;
+}
+
+/* Points and spheres that many radii away: their nearest point is in a crease, and little nearer than others. */
+TEST(what_is_far_away_finds_its_nearest_point_and_what_it_touches)
+{
+    dist_context *ctx = shape_context();
+    const float box[6] = {0, 0, 0, 0.5f, 0.3f, 0.1f}, torus[5] = {0, 0, 0, 0.5f, 0.2f};
+    const double half[3] = {(double)box[3], (double)box[4], (double)box[5]};
+    const float far[] = {1.2f, 2, 4, 10, 30};
+    for (int k = 0; k < 10; k++) {
+        int boxed = k < 5, other = 0, lost = 0;
+        dist_field field = boxed ? dist_field_box(box) : dist_field_torus(torus);
+        double worst = 0, touch = 0, radius = (double)field.radius;
+        test_random random = test_random_seed(71 + (unsigned)k);
+        for (int i = 0; i < RAYS; i++) {
+            test_random_direction(&random, points + 3 * i);
+            for (int axis = 0; axis < 3; axis++) points[3 * i + axis] *= far[k % 5] * field.radius;
+        }
+        CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &field, RAYS, points, closest, distance, status), ctx);
+        for (int i = RAYS; i-- > 0;) { /* spheres, which take the points' place from the end on */
+            double p[3], f;
+            point_of(points + 3 * i, p);
+            f = boxed ? box_distance(half, p) : torus_distance((double)torus[3], (double)torus[4], p);
+            double off = fabs(f - (double)distance[i]);
+            CHECK_EQUAL(DIST_RAY_HIT, status[i]);
+            other += off > 1e-3 * radius;
+            if (off <= 1e-3 * radius) worst = fmax(worst, off);
+            for (int axis = 0; axis < 3; axis++) points[4 * i + axis] = (float)p[axis];
+            points[4 * i + 3] = (float)(f + 2e-3 * radius);
+        }
+        CHECK_STATUS(DIST_OK, dist_field_collide(ctx, &field, RAYS, points, contacts), ctx);
+        for (int i = 0; i < RAYS; i++) {
+            if (contacts[i].status != DIST_RAY_HIT) lost++;
+            else touch = fmax(touch, fabs((double)contacts[i].depth - 2e-3 * radius));
+        }
+        CHECK(worst <= (k % 5 < 2 ? 1e-4 : 6e-4) * radius);
+        CHECK(touch <= 1.2e-3 * radius);
+        CHECK(other <= (k % 5 < 2 ? 0 : 3));
+        CHECK(lost <= other);
+        if (test_state.verbose)
+            printf("    %s, %g radii away: off %.2g radii, depth %.2g; other parts %d, contacts lost %d of %d\n",
+                   boxed ? "box" : "torus", (double)far[k % 5], worst / radius, touch / radius, other, lost, RAYS);
+    }
+    dist_context_destroy(ctx);
+}
+
+/* Where a field stands far from the origin the rounding of points changes f: what is exact then, and the bounds. */
+TEST(fields_far_from_the_origin_are_found_to_within_what_floats_can_tell)
+{
+    dist_context *ctx = shape_context();
+    const float at[] = {0, 10, 100, 1000};
+    for (int k = 0; k < 8; k++) {
+        float x = at[k / 2], numbers[4] = {0, 0, 0, 0.5f};
+        int beyond = 0, hits = 0;
+        double worst = 0, c = (double)x;
+        dist_field field;
+        dist_render_desc how;
+        dist_stats stats;
+        test_random random = test_random_seed(91 + (unsigned)k);
+        memset(&how, 0, sizeof how);
+        how.certified = k & 1;
+        numbers[0] = x;
+        field = dist_field_sphere(numbers);
+        for (int i = 0; i < RAYS; i++) {
+            for (int axis = 0; axis < 3; axis++) {
+                float toward = test_random_float(&random, -0.3f, 0.3f);
+                origins[3 * i + axis] = test_random_float(&random, -3, 3);
+                points[3 * i + axis] = test_random_float(&random, -1, 1);
+                if (axis == 0) {
+                    origins[3 * i] += x;
+                    points[3 * i] += x;
+                    toward += x;
+                }
+                directions[3 * i + axis] = toward - origins[3 * i + axis];
+            }
+        }
+        CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, RAYS, origins, directions, &how, nearest, &stats), ctx);
+        for (int i = 0; i < RAYS; i++) {
+            double o[3], d[3], along = 0, square = -0.25, length;
+            point_of(origins + 3 * i, o);
+            point_of(directions + 3 * i, d);
+            o[0] -= c;
+            length = shape_length(d[0], d[1], d[2]);
+            for (int axis = 0; axis < 3; axis++) {
+                along -= o[axis] * d[axis] / length;
+                square += o[axis] * o[axis];
+            }
+            if (!(square > 1e-3) || !blocked(&nearest[i]) || along * along < square) continue;
+            hits++;
+            double off = fabs((double)nearest[i].distance - (along - sqrt(along * along - square)));
+            beyond += off > (double)nearest[i].error;
+        }
+        CHECK(hits > RAYS / 2);
+        CHECK_EQUAL(0, beyond);
+        CHECK_EQUAL(0, (int)(stats.steepest * 1e6f));
+        CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &field, RAYS, points, closest, distance, status), ctx);
+        for (int i = 0; i < RAYS; i++) {
+            double p[3];
+            point_of(points + 3 * i, p);
+            CHECK_EQUAL(DIST_RAY_HIT, status[i]);
+            worst = fmax(worst, fabs(shape_length(p[0] - c, p[1], p[2]) - 0.5 - (double)distance[i]));
+        }
+        CHECK_NEAR(0, worst, 2e-6 + 3e-7 * c);
+        if (test_state.verbose)
+            printf("    %g off: %d hits, %d beyond their bounds; distances off %.2g\n", c, hits, beyond, worst);
+    }
+    dist_context_destroy(ctx);
+}
+
 /* Against the nearest of many surface points, found by tracing. */
 static double surface_sample(const dist_field *field, dist_context *ctx, float *surface, int *count)
 {
@@ -790,6 +913,8 @@ int main(int argc, char **argv)
     RUN(a_ray_looks_as_far_as_it_is_told_in_lengths_of_its_direction);
     RUN(any_hit_and_max_distance_are_refused_where_they_mean_nothing);
     RUN(closest_points_of_distances_are_exact);
+    RUN(what_is_far_away_finds_its_nearest_point_and_what_it_touches);
+    RUN(fields_far_from_the_origin_are_found_to_within_what_floats_can_tell);
     RUN(closest_points_of_other_fields_are_on_the_surface_and_near);
     RUN(closest_points_of_networks_lie_on_their_surface);
     RUN(closest_points_of_fields_without_an_inside_are_found);

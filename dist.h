@@ -9721,8 +9721,8 @@ static float disti_paper_alpha(const dist_render_desc *how)
 /* What the rounding of f, of numbers of the radius's size, and of points where the field stands may change f by. */
 static float disti_field_noise(const dist_field *field)
 {
-    const float *c = field->center;
-    return 5e-7f * field->radius + 1.2e-7f * disti_length(c[0], c[1], c[2]);
+    double c[3] = {(double)field->center[0], (double)field->center[1], (double)field->center[2]};
+    return 5e-7f * field->radius + (float)(1.2e-7 * sqrt(disti_dot(c, c)));
 }
 
 static dist_status disti_tracer_init(disti_tracer *tracer, dist_context *ctx, const dist_field *field,

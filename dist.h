@@ -698,7 +698,8 @@ DIST_API dist_tape *dist_tape_create(dist_context *ctx, const dist_camera *camer
 DIST_API void dist_tape_destroy(dist_tape *tape);
 
 /* Traces one ray per pixel and fills the planes that are not NULL. desc and tape may be NULL.
-   The tape borrows what the field points to until its last dist_render_backward. No allocator call.
+   The tape borrows what the field points to until its last dist_render_backward; what that is then, another code or
+   other weights, must be what it was: the gradient would be neither's. No allocator call.
    Rays that miss: mask 0, depth and distance desc->background, normal 0, silhouette > 0. UNRESOLVED: mask 0, normal 0,
    depth and distance the best so far. */
 DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, const dist_camera *camera,
@@ -708,8 +709,9 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
 /* Adjoint of the dist_render that filled the tape: reads d_out's depth, distance, normal, color, and silhouette if that
    was rendered; adds to grads; with how.relax_band color also at misses: outlines move, though not those that lie
    before another surface. Of DIST_RAY_INSIDE only the silhouette counts, also where how.inside makes a hit of it; a
-   silhouette beside the bounding sphere is the camera's alone, not a scene's placements'. What is not finite in d_out
-   counts as 0. d_out->stats, if given, gets capped, backward_points and skipped added. No allocator call. */
+   silhouette beside the bounding sphere is the camera's alone, not a scene's placements'. A ReLU net's silhouette has its
+   least |f| at a kink: its gradient is that of one side. What is not finite in d_out counts as 0. d_out->stats, if
+   given, gets capped, backward_points and skipped added. No allocator call. */
 DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *tape, const dist_images *d_out,
                                           const dist_gradients *grads);
 #endif
@@ -4459,9 +4461,10 @@ static void disti_backward_seed(void *user, size_t first, size_t count, const fl
     else memcpy(d_sdf, job->d_sdf + at, count * sizeof(float));
     if (job->seed_fn && job->d_sdf) memcpy(job->d_sdf + at, d_sdf, count * sizeof(float));
     if (!job->d_points || !gradient) return;
-    int all = disti_finite_all(count, d_sdf) && disti_finite_all(3 * count, gradient);
-    for (float *d = job->d_points + 3 * at; count > 0; count--, d += 3, gradient += 3, d_sdf++) {
-        if (!all && (!disti_finite(*d_sdf) || !disti_finite_all(3, gradient))) continue;
+    const float *p = job->points + 3 * at;
+    int all = disti_finite_all(count, d_sdf) && disti_finite_all(3 * count, gradient) && disti_finite_all(3 * count, p);
+    for (float *d = job->d_points + 3 * at; count > 0; count--, d += 3, gradient += 3, p += 3, d_sdf++) {
+        if (!all && !(disti_finite(*d_sdf) && disti_finite_all(3, gradient) && disti_finite_all(3, p))) continue;
         d[0] += *d_sdf * gradient[0];
         d[1] += *d_sdf * gradient[1];
         d[2] += *d_sdf * gradient[2];
@@ -5015,10 +5018,13 @@ typedef struct disti_scene_link {
     double *d_code;
 } disti_scene_link;
 
-/* What a pull g = dL/dp on a point, and `own` on log s besides, add to a placement's seven numbers. */
+/* What a pull g = dL/dp on a point, and `own` on log s besides, add to a placement's seven numbers: nothing where one
+   of them is not finite. */
 static void disti_placed_pull(const disti_placed *placed, const float *p, const double g[3], double own, double *d)
 {
     double r[3], torque[3];
+    if (!disti_finite_all(3, p) || !disti_finite_double(own)) return;
+    if (!disti_finite_double(g[0]) || !disti_finite_double(g[1]) || !disti_finite_double(g[2])) return;
     for (int k = 0; k < 3; k++) r[k] = (double)p[k] - (double)placed->translation[k];
     disti_cross(g, r, torque);
     d[0] += own - disti_dot(g, r);

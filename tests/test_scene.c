@@ -1177,6 +1177,63 @@ TEST(what_is_not_finite_stays_so)
     dist_context_destroy(ctx);
 }
 
+/* A color that is the point itself. */
+static void point_color(void *user, int worker, size_t n, const float *points, float *color)
+{
+    (void)user, (void)worker;
+    memcpy(color, points, 3 * n * sizeof(float));
+}
+
+static void point_color_adjoint(void *user, int worker, size_t n, const float *points, const float *d_color,
+                                float *d_points, double *d_code, double *d_color_code)
+{
+    (void)user, (void)worker, (void)points, (void)d_code, (void)d_color_code;
+    for (size_t i = 0; d_points && i < 3 * n; i++) d_points[i] += d_color[i];
+}
+
+TEST(what_is_not_finite_takes_nothing_from_a_placement)
+{
+    enum { CODE = 13 }; /* a box's six numbers and seven */
+    dist_context *ctx = test_context();
+    const float box[6] = {0, 0, 0, 0.5f, 0.3f, 0.4f}, bad[3] = {(float)NAN, (float)INFINITY, 0};
+    dist_field field = dist_field_box(box), all;
+    dist_instance one;
+    memset(&one, 0, sizeof one);
+    field.color_fn = point_color;
+    field.color_adjoint_fn = point_color_adjoint;
+    one.field = &field;
+    dist_scene *scene = dist_scene_create(ctx, 1, &one);
+    all = dist_scene_field(scene);
+    REQUIRE(scene != NULL && all.code_size == CODE);
+    for (int k = 0; k < 8; k++) { /* a point, or its weight, that is not finite; f's gradient, the color's */
+        int color = k & 1, seed = k & 2;
+        float points[6] = {0.7f, 0.2f, 0.1f, 0.1f, 0.6f, 0.2f}, weight[6] = {1, 2, 3, 1, 2, 3};
+        float d_points[2][6] = {{0}}, code[2][CODE] = {{0}};
+        for (int n = 1; n <= 2; n++) {
+            dist_gradients grads;
+            memset(&grads, 0, sizeof grads);
+            grads.code = code[n - 1];
+            if (n == 2 && seed) weight[color ? 3 : 1] = bad[k / 4];
+            if (n == 2 && !seed) points[3] = bad[k / 4];
+            dist_status status =
+                color ? dist_color_backward(ctx, &all, (size_t)n, points, weight, NULL, &grads)
+                      : dist_field_backward(ctx, &all, (size_t)n, points, weight, NULL, NULL, d_points[n - 1], &grads);
+            CHECK_STATUS(DIST_OK, status, ctx);
+        }
+        for (int i = 0; i < CODE; i++) CHECK_NEAR(code[0][i], code[1][i], 0);
+        for (int i = 0; i < 6; i++) CHECK_NEAR(d_points[0][i], d_points[1][i], 0);
+        CHECK(code[0][CODE - 3] != 0 && code[0][6] != 0);
+        memset(d_points, 0, sizeof d_points);
+        dist_gradients none;
+        memset(&none, 0, sizeof none);
+        if (seed || color) continue;
+        CHECK_STATUS(DIST_OK, dist_field_backward(ctx, &field, 2, points, weight, NULL, NULL, d_points[0], &none), ctx);
+        CHECK(d_points[0][0] != 0 && d_points[0][3] == 0 && d_points[0][4] == 0 && d_points[0][5] == 0);
+    }
+    dist_scene_destroy(scene);
+    dist_context_destroy(ctx);
+}
+
 TEST(colors_are_those_of_the_instance_that_is_hit)
 {
     enum { N = 200 };
@@ -1410,6 +1467,7 @@ int main(int argc, char **argv)
     RUN(radii_that_floats_cannot_square_are_refused);
     RUN(scenes_refuse_what_cannot_be_placed);
     RUN(what_is_not_finite_stays_so);
+    RUN(what_is_not_finite_takes_nothing_from_a_placement);
     RUN(colors_are_those_of_the_instance_that_is_hit);
     RUN(colors_outside_of_the_sphere_move_as_its_nearest_point_does);
     RUN(the_figures_of_an_instance_hold_no_farther_out_in_a_large_scene);

@@ -709,9 +709,9 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
 /* Adjoint of the dist_render that filled the tape: reads d_out's depth, distance, normal, color, and silhouette if that
    was rendered; adds to grads; with how.relax_band color also at misses: outlines move, though not those that lie
    before another surface. Of DIST_RAY_INSIDE only the silhouette counts, also where how.inside makes a hit of it; a
-   silhouette beside the bounding sphere is the camera's alone, not a scene's placements'. A ReLU net's silhouette has its
-   least |f| at a kink: its gradient is that of one side. What is not finite in d_out counts as 0. d_out->stats, if
-   given, gets capped, backward_points and skipped added. No allocator call. */
+   silhouette beside the bounding sphere is the camera's alone, not a scene's placements'. The least |f| of a ReLU net
+   lies at a kink: the silhouette's gradient is that of one side. What is not finite in d_out counts as 0.
+   d_out->stats, if given, gets capped, backward_points and skipped added. No allocator call. */
 DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *tape, const dist_images *d_out,
                                           const dist_gradients *grads);
 #endif

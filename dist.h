@@ -11409,8 +11409,9 @@ static int disti_foot_pull(const dist_field *field, disti_foot *foot, float gain
         foot->drift[i] = far ? more : 0.0f;
         drift += foot->drift[i] * foot->drift[i];
     }
-    if (!(drift > 1e-8f * r * r)) memset(foot->drift, 0, sizeof foot->drift);
-    if (gain < 1e-5f * r && !(drift > 1e-8f * r * r)) foot->share *= 0.25f;
+    int drifts = drift > 1e-8f * r * r;
+    if (!drifts) memset(foot->drift, 0, sizeof foot->drift);
+    if (gain < 1e-5f * r && !drifts) foot->share *= 0.25f;
     if (foot->share < 0.02f) return 0;
     memcpy(foot->from, foot->best, sizeof foot->from);
     memcpy(foot->x, foot->best, sizeof foot->x);

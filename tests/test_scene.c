@@ -1177,14 +1177,13 @@ TEST(what_is_not_finite_stays_so)
     dist_context_destroy(ctx);
 }
 
-/* A color that is the point itself. */
-static void point_color(void *user, int worker, size_t n, const float *points, float *color)
+static void place_color(void *user, int worker, size_t n, const float *points, float *color)
 {
     (void)user, (void)worker;
     memcpy(color, points, 3 * n * sizeof(float));
 }
 
-static void point_color_adjoint(void *user, int worker, size_t n, const float *points, const float *d_color,
+static void place_color_adjoint(void *user, int worker, size_t n, const float *points, const float *d_color,
                                 float *d_points, double *d_code, double *d_color_code)
 {
     (void)user, (void)worker, (void)points, (void)d_code, (void)d_color_code;
@@ -1199,8 +1198,8 @@ TEST(what_is_not_finite_takes_nothing_from_a_placement)
     dist_field field = dist_field_box(box), all;
     dist_instance one;
     memset(&one, 0, sizeof one);
-    field.color_fn = point_color;
-    field.color_adjoint_fn = point_color_adjoint;
+    field.color_fn = place_color;
+    field.color_adjoint_fn = place_color_adjoint;
     one.field = &field;
     dist_scene *scene = dist_scene_create(ctx, 1, &one);
     all = dist_scene_field(scene);
@@ -1292,19 +1291,6 @@ TEST(colors_are_those_of_the_instance_that_is_hit)
     dist_net_destroy(net);
     model_free(&m);
     dist_context_destroy(ctx);
-}
-
-static void place_color(void *user, int worker, size_t n, const float *points, float *color)
-{
-    (void)user, (void)worker;
-    memcpy(color, points, 3 * n * sizeof(float));
-}
-
-static void place_color_adjoint(void *user, int worker, size_t n, const float *points, const float *d_color,
-                                float *d_points, double *d_code, double *d_color_code)
-{
-    (void)user, (void)worker, (void)points, (void)d_code, (void)d_color_code;
-    for (size_t i = 0; d_points && i < 3 * n; i++) d_points[i] += d_color[i];
 }
 
 /* The color is the place that is asked for. Outside of the sphere that is c + r n, n = (p - c) / |p - c|, so that d . c

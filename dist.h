@@ -40,7 +40,8 @@
 
    Conventions: world to camera x_cam = R x + t, x right, y down, z forward; pixel centers at integers unless the camera
    says otherwise; depth is z, distance is along the ray; images are (height, width[, channels]), top row first; points
-   are (n, 3); a zeroed _desc means the defaults and NULL means the same; gradients are added to, never written.
+   are (n, 3); a zeroed _desc means the defaults and NULL means the same; gradients are added to, never written;
+   what is made, loaded or read is NULL on failure.
 
    Contents:
    @ 01 config, status, hooks   @ 02 context   @ 03 kernels   @ 04 field   @ 05 net   @ 06 camera
@@ -285,7 +286,8 @@ typedef struct dist_gradients {
 /* Adjoint of dist_field_eval: with L = sum_i d_sdf[i] f(points[i]), adds dL/dcode and dL/dweights to grads and
    d_sdf[i] * grad f(points[i]) to d_points (n, 3) unless NULL.
    d_sdf (n): the weights, in; with seed_fn it is filled from it instead: then value and adjoint cost one pass together.
-   Points that are not finite, or whose d_sdf is not, add nothing.
+   Points that are not finite, or whose d_sdf is not, add nothing; nor to weights does one at which a number in the net,
+   or its derivative, is beyond 2^56.
    grads is not NULL, even for d_points alone; what it holds of camera and color must be NULL. */
 DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *field, size_t n, const float *points,
                                          float *d_sdf, dist_seed_fn seed_fn, void *seed_user, float *d_points,
@@ -300,8 +302,9 @@ DIST_API dist_status dist_color_backward(dist_context *ctx, const dist_field *fi
 
 /* What makes f a distance: *loss = weight * mean over the n points of (|grad f| - 1)^2, and its gradient is added to
    grads->code and ->weights. loss and grads may be NULL; what grads holds of camera and color must be. An error leaves
-   *loss alone. Points that are not finite, or whose gradient is not, add nothing. Exact where the field has second_fn
-   (a ReLU's kinks have no share, as in automatic differentiation), else by differences over 1e-3 of the radius. */
+   *loss alone. Points that are not finite, or whose f or gradient is not, add nothing, nor to weights those named at
+   dist_field_backward. Exact where the field has second_fn (a ReLU's kinks have no share, as in automatic
+   differentiation), else by differences over 1e-3 of the radius. */
 DIST_API dist_status dist_field_eikonal(dist_context *ctx, const dist_field *field, size_t n, const float *points,
                                         float weight, float *loss, const dist_gradients *grads);
 #endif
@@ -393,8 +396,9 @@ enum {
    made afterwards have field.coarse_fn, and as field.coarse_error the largest difference to f32 met at 768 points of
    the bounding sphere when the shape is made: a sample, not a proof. The point's columns and the last layer stay in
    f32; a block in which anything overflows is evaluated in f32. DIST_UNSUPPORTED: a processor or build without these
-   instructions, LayerNorm, weights beyond 65504 in F16 (set later, they turn it off). Shapes on contexts of another isa
-   than DIST_ISA_AVX512 have no coarse_fn. No shape of the net may be in use by another thread. */
+   instructions, LayerNorm, weights beyond 65504 in F16 (set later, they turn it off); then, and on contexts of another
+   isa than DIST_ISA_AVX512, coarse_fn is NULL: dist_context_clear, where f32 will do. No shape of the net
+   may be in use by another thread. */
 DIST_API dist_status dist_net_set_half(dist_context *ctx, dist_net *net, int kind);
 /* What is in force: DIST_HALF_OFF, F16 or BF16. */
 DIST_API int dist_net_half(const dist_net *net);
@@ -489,7 +493,7 @@ DIST_API void dist_camera_get_opengl(const dist_camera *camera, float camera_to_
 DIST_API dist_status dist_camera_set_colmap(dist_camera *camera, const float quaternion[4], const float translation[3]);
 DIST_API void dist_camera_get_colmap(const dist_camera *camera, float quaternion[4], float translation[3]);
 /* rotation <- exp([w]x) rotation, kept orthonormal; translation += t. The step for a gradient of dist_gradients:
-   minus a rate times it, or what dist_adam_step makes of six zeros. */
+   minus a rate times it, or what dist_adam_step makes of six zeros. One that is not finite moves nothing. */
 DIST_API void dist_camera_move(dist_camera *camera, const float w[3], const float t[3]);
 /* Center of projection -R^T t and unit direction of pixel (x, y), in world coordinates. */
 DIST_API void dist_camera_ray(const dist_camera *camera, float x, float y, float origin[3], float direction[3]);
@@ -4375,7 +4379,6 @@ DIST_API dist_status dist_color_eval(dist_context *ctx, const dist_field *field,
     return DIST_OK;
 }
 
-/* Value, gradient, seeds and code adjoint of any field: fused where it can, else block by block. */
 /* adjoint_fn of the points that add something: neither they nor their seeds are NaN or infinite. */
 static void disti_field_adjoint(const dist_field *field, int worker, size_t n, const float *points, const float *d_sdf,
                                 double *d_code)
@@ -4388,6 +4391,7 @@ static void disti_field_adjoint(const dist_field *field, int worker, size_t n, c
     }
 }
 
+/* Value, gradient, seeds and code adjoint of any field: fused where it can, else block by block. */
 static void disti_field_fused(const dist_field *field, int worker, size_t n, const float *points, dist_seed_fn seed_fn,
                               void *seed_user, double *d_code)
 {
@@ -4492,7 +4496,8 @@ static void disti_backward_run(dist_context *ctx, disti_backward_job *job, size_
 {
     size_t size = (size_t)job->field->code_size;
     if (n == 0) return;
-    job->pieces = disti_cut(n, 4 * DISTI_BLOCK, DISTI_SLOTS);
+    int small = job->field->cost > 0.0f && job->field->cost < 5e4f; /* to which its code's sums add a few percent */
+    job->pieces = disti_cut(n, (small ? 8 : 4) * DISTI_BLOCK, DISTI_SLOTS);
     job->d_code = d_code ? ctx->partial : NULL;
     if (d_code) memset(ctx->partial, 0, (size_t)job->pieces.count * size * sizeof(double));
     disti_run(ctx, job->pieces.count, disti_backward_task, job);
@@ -4704,7 +4709,7 @@ DIST_API dist_status dist_field_eikonal(dist_context *ctx, const dist_field *fie
         disti_field_eval_all(ctx, field, count, points + 3 * at, sdf, gradient);
         for (size_t i = 0; i < count; i++) {
             float *g = gradient + 3 * i, length = disti_length(g[0], g[1], g[2]), factor = 0.0f;
-            if (disti_finite(length) && disti_finite_all(3, points + 3 * (at + i))) {
+            if (disti_finite(sdf[i]) && disti_finite(length) && disti_finite_all(3, points + 3 * (at + i))) {
                 sum += ((double)length - 1.0) * ((double)length - 1.0);
                 if (length > 1e-12f) factor = 2.0f * weight * (1.0f - 1.0f / length) / (float)n;
             }
@@ -4725,9 +4730,9 @@ DIST_API dist_status dist_field_eikonal(dist_context *ctx, const dist_field *fie
 }
 #endif
 
-/* |f| from which on lipschitz_far holds: a clamped training leaves slopes of no meaning beyond. */
 static int disti_is_coarse(const dist_field *field) { return field->coarse_fn && field->eval_fn == field->coarse_fn; }
 
+/* |f| from which on lipschitz_far holds: a clamped training leaves slopes of no meaning beyond. */
 static float disti_far_from(const dist_field *field)
 {
     if (field->lipschitz_within > 0.0f) return field->lipschitz_within;
@@ -5503,7 +5508,7 @@ DIST_API dist_status dist_scene_find(dist_scene *scene, size_t n, const float *p
 DIST_API void dist_similarity_move(dist_similarity *placement, const float step[7])
 {
     float zero[9] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
-    if (!placement || !step) return;
+    if (!placement || !step || !disti_finite_all(7, step)) return;
     if (placement->scale == 0.0f) placement->scale = 1.0f;
     if (memcmp(placement->rotation, zero, sizeof zero) == 0)
         placement->rotation[0] = placement->rotation[4] = placement->rotation[8] = 1.0f;
@@ -8052,6 +8057,22 @@ static int disti_groups_pay(dist_shape *shape, const float *points)
     return (share < (shape->many ? 1.1 : 0.9)) + (share < 1.15);
 }
 
+/* How far coarse_fn is at most from sdf over a block of points; one by one where the block became f32's, as something
+   in it overflows. */
+static float disti_coarse_apart(const dist_field *field, const float *points, const float *sdf)
+{
+    float coarse[DISTI_BLOCK], most = 0.0f;
+    for (size_t each = DISTI_BLOCK; each > 0 && !(most > 0.0f); each = each > 1) {
+        for (size_t j = 0; j < DISTI_BLOCK; j += each)
+            field->coarse_fn(field->user, 0, each, points + 3 * j, coarse + j, NULL);
+        for (size_t j = 0; j < DISTI_BLOCK; j++) {
+            float error = coarse[j] > sdf[j] ? coarse[j] - sdf[j] : sdf[j] - coarse[j];
+            if (disti_finite(error)) most = DISTI_MAX(most, error);
+        }
+    }
+    return most;
+}
+
 /* Sampled |grad f| outside the surface: the 4/5 quantile near it, 31/32 beyond disti_far_from, at least 1. What matters
    is not the steepest spot but how far f exceeds the distance, which is its mean slope on the way; how.certified takes
    the largest all the same. Half of the 768 points are those of a fixed low-discrepancy sequence (the plastic number's)
@@ -8062,7 +8083,7 @@ static void disti_shape_slope(dist_shape *shape, const dist_field *field)
     enum { ROUNDS = 16, BINS = 256 };
     int bins[2][BINS], count[2] = {0, 0};
     float most[2] = {1.0f, 1.0f};
-    float points[3 * DISTI_BLOCK], sdf[DISTI_BLOCK], gradient[3 * DISTI_BLOCK], coarse[DISTI_BLOCK], slopes[2];
+    float points[3 * DISTI_BLOCK], sdf[DISTI_BLOCK], gradient[3 * DISTI_BLOCK], slopes[2];
     float beyond = disti_far_from(field);
     const dist_net *net = shape->net;
     disti_block b;
@@ -8088,12 +8109,7 @@ static void disti_shape_slope(dist_shape *shape, const dist_field *field)
             }
             j += round & 1 || length <= 1.0;
         }
-        if (field->coarse_fn) field->coarse_fn(shape, 0, DISTI_BLOCK, points, coarse, NULL);
         field->eval_fn(shape, 0, DISTI_BLOCK, points, sdf, gradient);
-        for (int j = 0; field->coarse_fn && j < DISTI_BLOCK; j++) {
-            float error = coarse[j] > sdf[j] ? coarse[j] - sdf[j] : sdf[j] - coarse[j];
-            if (disti_finite(error)) shape->half_error = DISTI_MAX(shape->half_error, error);
-        }
         disti_block_layout(net, disti_lane(shape->ctx, 0), &b);
         for (int l = 1; l < net->layers; l++)
             for (int k = 0; k < net->layer[l].prev; k++)
@@ -8107,6 +8123,7 @@ static void disti_shape_slope(dist_shape *shape, const dist_field *field)
             count[far]++;
             if (disti_finite(slope)) most[far] = DISTI_MAX(most[far], slope);
         }
+        if (field->coarse_fn) shape->half_error = DISTI_MAX(shape->half_error, disti_coarse_apart(field, points, sdf));
     }
     for (int far = 0; far < 2; far++) {
         int above = 0, bin = BINS - 1;
@@ -8804,10 +8821,28 @@ static dist_status disti_loader_channels(disti_loader *loader)
     return disti_loader_bad(loader, "dist.channels");
 }
 
+/* A misspelled key would be one that is absent. */
+static dist_status disti_loader_keys(disti_loader *loader)
+{
+    static const char known[] =
+        "|activation|output|input|skip|skip_order|skip_scale|encoding|encoding.levels|encoding.base|encoding.raw|"
+        "encoding.order|norm|norm.epsilon|level|code_size|channels|bound|clamp|";
+    for (size_t i = 0; i < loader->archive.meta_count; i++) {
+        const char *key = loader->archive.keys[i], *at = known;
+        size_t n = strlen(key);
+        if (n < 5 || memcmp(key, "dist.", 5) != 0) continue;
+        n -= 5;
+        while (*at && !(memcmp(at, "|", 1) == 0 && strncmp(at + 1, key + 5, n) == 0 && at[1 + n] == '|')) at++;
+        if (!*at) return disti_loader_fail(loader, DIST_BAD_FILE, "dist_net_load: metadata %s is not known", key, 0, 0);
+    }
+    return loader->status;
+}
+
 /* Everything the metadata says, but for what needs the tensors' shapes. */
 static dist_status disti_loader_meta(disti_loader *loader)
 {
     dist_net *net = loader->net;
+    if (disti_loader_keys(loader) != DIST_OK) return loader->status;
     static const int outputs[4] = {DISTI_OUTPUT_TANH, DISTI_OUTPUT_NONE, DISTI_OUTPUT_SIGMOID, DISTI_OUTPUT_TANH_TWICE};
     if (disti_loader_activation(loader) != DIST_OK || disti_loader_channels(loader) != DIST_OK) return loader->status;
     int encoding = disti_loader_choice(loader, "dist.encoding", "none|fourier");
@@ -8842,6 +8877,27 @@ static const disti_tensor *disti_loader_weight(const disti_loader *loader, int k
     return *gain ? disti_loader_find(loader, "lin", k, ".parametrizations.weight.original1") : NULL;
 }
 
+/* LayerNorm's weight or bias behind layer k, also by the name that DeepSDF's decoder gives it. */
+static const disti_tensor *disti_loader_norm(const disti_loader *loader, int k, const char *ending)
+{
+    const disti_tensor *norm = disti_loader_find(loader, "norm", k, ending);
+    return norm ? norm : disti_loader_find(loader, "bn", k, ending);
+}
+
+/* Metadata that is silent about LayerNorm leaves it to the tensors. */
+static dist_status disti_loader_norms(disti_loader *loader)
+{
+    int told = disti_archive_meta(&loader->archive, "dist.norm") != NULL;
+    for (int k = 0; k + 1 < loader->net->layers; k++) {
+        const disti_tensor *mean = disti_loader_find(loader, "bn", k, ".running_mean");
+        if (mean)
+            return disti_loader_fail(loader, DIST_UNSUPPORTED, "dist_net_load: tensor %s is of a batch normalization; "
+                                     "fold it into the layer before it", mean->name, 0, 0);
+        if (!told && disti_loader_norm(loader, k, ".weight")) loader->net->normed = 1;
+    }
+    return loader->status;
+}
+
 /* layers, their in and out, the skips and the code's size, from the tensors' shapes and the metadata. */
 static dist_status disti_loader_shapes(disti_loader *loader)
 {
@@ -8874,6 +8930,7 @@ static dist_status disti_loader_shapes(disti_loader *loader)
     if (net->layers == DISTI_MAX_LAYERS && disti_loader_weight(loader, DISTI_MAX_LAYERS, &gain))
         return disti_loader_fail(loader, DIST_UNSUPPORTED, "dist_net_load: more than %d layers", NULL, DISTI_MAX_LAYERS,
                           0);
+    if (disti_loader_norms(loader) != DIST_OK) return loader->status;
     double size = disti_loader_number(loader, "dist.code_size", 0, DISTI_MAX_WIDTH,
                                       net->layer[0].in - net->point_size);
     if (loader->status != DIST_OK) return loader->status;
@@ -8950,9 +9007,9 @@ static dist_status disti_loader_values(disti_loader *loader)
             disti_weight_norm(out, in, bias, w);
         disti_loader_read(loader, disti_loader_find(loader, "lin", l, ".bias"), "bias", l, out, bias);
         if (!net->normed || l + 1 == net->layers) continue;
-        disti_loader_read(loader, disti_loader_find(loader, "norm", l, ".weight"), "norm weight", l, out,
+        disti_loader_read(loader, disti_loader_norm(loader, l, ".weight"), "norm weight", l, out,
                           net->params + layer->norm_weight);
-        disti_loader_read(loader, disti_loader_find(loader, "norm", l, ".bias"), "norm bias", l, out,
+        disti_loader_read(loader, disti_loader_norm(loader, l, ".bias"), "norm bias", l, out,
                           net->params + layer->norm_bias);
     }
     if (net->code_count == 0) return loader->status;
@@ -9582,7 +9639,7 @@ DIST_API void dist_camera_get_colmap(const dist_camera *camera, float quaternion
 
 DIST_API void dist_camera_move(dist_camera *camera, const float w[3], const float t[3])
 {
-    if (!camera) return;
+    if (!camera || (w && !disti_finite_all(3, w)) || (t && !disti_finite_all(3, t))) return;
     if (w) disti_turn(w, camera->rotation);
     for (int i = 0; t && i < 3; i++) camera->translation[i] += t[i];
 }
@@ -15504,10 +15561,13 @@ typedef struct disti_photo_pair {
     double visibility, ssim;
 } disti_photo_pair;
 
-/* Weights and pixels of the bilinear sample at (u, v); 0 outside the picture. */
+/* Weights and pixels of the bilinear sample at (u, v); 0 outside the picture, by more than rounding. */
 static int disti_bilinear(const disti_view *view, double u, double v, size_t pixel[4], double part[2])
 {
-    if (!(u >= 0.0 && v >= 0.0 && u <= view->width - 1.0 && v <= view->height - 1.0)) return 0;
+    const double edge = 1e-9, most_u = view->width - 1.0, most_v = view->height - 1.0;
+    if (!(u >= -edge && v >= -edge && u <= most_u + edge && v <= most_v + edge)) return 0;
+    u = DISTI_MIN(DISTI_MAX(u, 0.0), most_u);
+    v = DISTI_MIN(DISTI_MAX(v, 0.0), most_v);
     size_t w = (size_t)view->width, x = (size_t)u, y = (size_t)v;
     size_t right = x + 1 < w ? 1 : 0, below = y + 1 < (size_t)view->height ? w : 0;
     part[0] = u - (double)x;

@@ -10,6 +10,12 @@ static inline const char *bench_origin(void)
     return origin && origin[0] ? origin : "dist.h, run by hand: machine and commit not noted";
 }
 
+/* What an option names, if it was given, must be among what there is. */
+static inline void check_found(const char *option, const char *name, int found)
+{
+    if (name && !found) { fail("%s %s: there is none of that name here", option, name); }
+}
+
 /* A network of the test data, which is not part of the repository: in DIST_DATA, or ../shared/data. */
 static inline const char *net_path(char path[PATH_SIZE], const char *name)
 {

@@ -442,11 +442,13 @@ int main(int argc, char **argv)
     fputs("compiled without oneDNN: make build/bench_blas where libdnnl-dev is installed\n", stderr);
 #endif
     puts("case,library,threads,batch,seconds,queries_per_s,gflops,peak_gflops,share,mode");
+    int found = 0;
     for (int i = 0; i < CASES; i++) {
         const net_case *c = &cases[i];
         double peak = 0;
         if (s.only_case && strcmp(s.only_case, c->name) != 0) { continue; }
         if (s.quick && !s.only_case && i != 0 && i != 2) { continue; }
+        found = 1;
         measure_dist(&s, c, &peak);
         measure_chain(&s, c, KERNELS, &peak);
 #ifdef WITH_CBLAS
@@ -456,5 +458,6 @@ int main(int argc, char **argv)
         measure_chain(&s, c, DNNL, &peak);
 #endif
     }
+    check_found("--case", s.only_case, found);
     return 0;
 }

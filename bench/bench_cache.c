@@ -127,6 +127,7 @@ int main(int argc, char **argv)
     }
     dist_shape *shape = dist_shape_create(ctx, net, dist_net_code(net, code));
     counted c = {dist_shape_field(shape), 0};
+    if (dist_context_status(ctx) == DIST_OK && !c.field.eval_fn) { fail("%s has no distance", model); }
     dist_field plain = c.field;
     plain.user = &c;
     plain.eval_fn = counted_eval;

@@ -237,15 +237,23 @@ int main(int argc, char **argv)
     tally tallies[MODES];
     memset(tallies, 0, sizeof tallies);
     puts("case,trace,gradient,samples,depth_error_start,depth_error_end,ratio,iou_start,iou_end,queries,seconds");
+    int found = 0;
+    for (int m = 0; s.only_mode && m < MODES; m++) {
+        found |= strcmp(s.only_mode, modes[m].name) == 0;
+    }
+    check_found("--mode", s.only_mode, found);
+    found = 0;
     for (int i = 0; i < CASES; i++) {
         const fit_case *c = &cases[i];
         if (s.only_case ? strcmp(s.only_case, c->name) != 0 : c->slow && !s.slow) { continue; }
+        found = 1;
         dist_net *net = load_net_or_skip(ctx, c->net);
         if (!net) { continue; }
         fit_one(ctx, &s, c, net, tallies);
         dist_net_destroy(net);
         if (s.quick) { break; }
     }
+    check_found("--case", s.only_case, found);
     print_tallies(tallies);
     dist_context_destroy(ctx);
     return 0;

@@ -412,18 +412,23 @@ int main(int argc, char **argv)
 #endif
     puts("case,isa,threads,batch,seconds,queries_per_s,gflops,peak_gflops,share,mode,of_forward,executed,max_error,"
          "rms_error,speedup,peak_speedup,of_alive,reverse_of_alive");
+    int found = 0, measured = 0;
     for (int i = 0; i < (s.model ? 1 : (int)CASES); i++) {
         const net_case *c = s.model ? NULL : &cases[i];
         if (c && s.only_case && strcmp(s.only_case, c->name) != 0) { continue; }
         if (c && s.quick && !s.only_case && i != 0 && i + 1 != CASES) { continue; }
+        found = 1;
         for (int isa = DIST_ISA_SCALAR; isa <= DIST_ISA_NEON; isa++) {
             if (!disti_cpu_has(isa)) { continue; }
             if (s.quick && !s.only_isa && isa == DIST_ISA_SCALAR && i == 0) { continue; } /* seconds a pass */
             if (s.only_isa && strcmp(s.only_isa, dist_isa_name(isa)) != 0) { continue; }
             for (int threads = 1; threads <= most; threads += most > 1 ? most - 1 : 1) {
                 measure_net(&s, c, isa, threads);
+                measured = 1;
             }
         }
     }
+    check_found("--case", s.only_case, found);
+    check_found("--isa", s.only_isa, measured);
     return 0;
 }

@@ -44,7 +44,14 @@ static const step_case cases[] = {
     {"deepsdf_512_he", "deepsdf_512_he", 0, 0, 0, 0},
 };
 
-enum { CASES = sizeof cases / sizeof cases[0], STEPS_MOST = 1000 };
+typedef struct frame_case {
+    const char *name;
+    int layers, width, pixels_x, pixels_y;
+} frame_case;
+
+static const frame_case frames[] = {{"game_4x64", 4, 64, 512, 512}, {"game_2x32", 2, 32, 640, 360}};
+
+enum { CASES = sizeof cases / sizeof cases[0], FRAME_CASES = sizeof frames / sizeof frames[0], STEPS_MOST = 1000 };
 static const double PAPER_QUERIES = 887000;
 static const double MOVED_MOST = 5e-4; /* radii a step in the warm rows */
 
@@ -411,12 +418,20 @@ int main(int argc, char **argv)
     check(ctx);
     puts("case,mode,resolution,threads,seconds,queries,backward_points,peak_gflops,ratio,bytes,hits,"
          "queries_per_hit,moved,render,backward,render_rate,backward_rate,rate,network_rate");
+    int found = 0;
     for (int i = 0; i < CASES; i++) {
         int wanted = set.only ? strcmp(set.only, cases[i].name) == 0 : !set.quick || cases[i].quick;
-        if (wanted) { run_case(ctx, &cases[i], &set, &memory); }
+        if (!wanted) { continue; }
+        run_case(ctx, &cases[i], &set, &memory);
+        found = 1;
     }
-    if (!set.only || strcmp(set.only, "game_4x64") == 0) { run_frames(ctx, "game_4x64", 4, 64, 512, 512, &memory); }
-    if (!set.only || strcmp(set.only, "game_2x32") == 0) { run_frames(ctx, "game_2x32", 2, 32, 640, 360, &memory); }
+    for (int i = 0; i < FRAME_CASES; i++) {
+        const frame_case *f = &frames[i];
+        if (set.only && strcmp(set.only, f->name) != 0) { continue; }
+        run_frames(ctx, f->name, f->layers, f->width, f->pixels_x, f->pixels_y, &memory);
+        found = 1;
+    }
+    check_found("--case", set.only, found);
     dist_context_destroy(ctx);
     return 0;
 }

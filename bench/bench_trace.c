@@ -136,11 +136,15 @@ int main(int argc, char **argv)
         dist_shape_destroy(shape);
         dist_net_destroy(net);
     }
+    int found = ladder_of != NULL;
     for (int i = 0; !ladder_of && i < CASES; i++) {
         const trace_case *c = &cases[i];
         int wanted = only ? strcmp(only, c->name) == 0 : quick ? c->quick : slow || !c->slow;
-        if (wanted) { run_case(ctx, c, size, quick); }
+        if (!wanted) { continue; }
+        run_case(ctx, c, size, quick);
+        found = 1;
     }
+    check_found("--case", only, found);
     dist_context_destroy(ctx);
     return 0;
 }

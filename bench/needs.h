@@ -84,6 +84,7 @@ static need_result need_run(const char *model, int code, int size, int repeats, 
     desc.allocator.free_fn = count_free;
     dist_context *ctx = dist_context_create(&desc);
     dist_net *net = load_model(ctx, model);
+    if (code >= dist_net_code_count(net)) { fail("--code %d: the model has %d", code, dist_net_code_count(net)); }
     size_t weights = memory.live;
     dist_shape *shape = dist_shape_create(ctx, net, dist_net_code(net, code));
     dist_field field = dist_shape_field(shape);

@@ -15,6 +15,7 @@
 #include "../examples/common.h"
 #include "../examples/fit.h"
 #include "../examples/shapes.h"
+#include "bench.h"
 #include "plot.h"
 #include "results.h"
 #include <time.h>
@@ -1175,10 +1176,12 @@ int main(int argc, char **argv)
     if (!s.size) { s.size = s.r.quick ? 40 : 96; }
     if (s.r.quick) { s.iterations = 20; }
     bench b = bench_create(&s);
-    if (results_wanted(&s.r, "completion")) { completion(&b); }
-    if (results_wanted(&s.r, "completion_silhouette")) { silhouettes(&b); }
-    if (results_wanted(&s.r, "completion_curves")) { curves(&b); }
-    if (results_wanted(&s.r, "completion_gradients")) { gradients(&b); }
+    int found = 0;
+    if (results_wanted(&s.r, "completion")) { completion(&b), found = 1; }
+    if (results_wanted(&s.r, "completion_silhouette")) { silhouettes(&b), found = 1; }
+    if (results_wanted(&s.r, "completion_curves")) { curves(&b), found = 1; }
+    if (results_wanted(&s.r, "completion_gradients")) { gradients(&b), found = 1; }
+    check_found("--only", s.r.only, found);
     bench_destroy(&b);
     return 0;
 }

@@ -311,7 +311,7 @@ static void blur(int width, int height, const float *from, float sigma, float *t
     free(between);
 }
 
-/* The two nearest photos that look the same way. */
+/* The two nearest photos that look the same way; of two photos the other one, twice. */
 static void find_neighbors(fit *f)
 {
     for (size_t i = 0; i < f->view_count; i++) {
@@ -334,7 +334,7 @@ static void find_neighbors(fit *f)
             }
             distance += along > 0.5 ? 0 : 1e6;
             for (int k = 0; k < NEIGHBORS; k++) {
-                if (distance >= best[k]) { continue; }
+                if (v->neighbor[k] >= 0 && distance >= best[k]) { continue; }
                 for (int m = NEIGHBORS - 1; m > k; m--) {
                     best[m] = best[m - 1];
                     v->neighbor[m] = v->neighbor[m - 1];
@@ -343,6 +343,9 @@ static void find_neighbors(fit *f)
                 v->neighbor[k] = (int)j;
                 break;
             }
+        }
+        for (int k = 1; k < NEIGHBORS; k++) {
+            if (v->neighbor[k] < 0) { v->neighbor[k] = v->neighbor[k - 1]; }
         }
     }
 }

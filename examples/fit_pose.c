@@ -723,6 +723,7 @@ static request read_options(int argc, char **argv)
     fit_options checked = *o;
     if (o->depth_path) { checked.target = NULL; } /* here the one is the shape, the other the picture of it */
     check_fit_options(&checked);
+    if (o->weights[2] > 0.0f) { fail("--weights D,S,0: there is no code to weigh here"); }
     if (r.trials && o->depth_path) { fail("--trials renders its own observations; leave out --depth"); }
     if (!o->out && !r.trials) { fail("--out STEM is needed: where the results go"); }
     if (!o->model) { o->model = "embedded"; }

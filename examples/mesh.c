@@ -49,6 +49,7 @@ int main(int argc, char **argv)
         fail("--out FILE.ply or --out FILE.obj is needed%s%s", path ? ", got " : "", path ? path : "");
     }
 
+    check_path(path);
     dist_context *ctx = dist_context_create(&settings);
     dist_net *net = load_model(ctx, model);
     float *code = choose_code(net, code_text);
@@ -61,7 +62,6 @@ int main(int argc, char **argv)
     dist_mesh *mesh = dist_mesh_extract(ctx, &field, &desc);
     double seconds = seconds_now() - start;
     check(ctx);
-    make_folders(path);
     dist_mesh_save(ctx, mesh, path);
     check(ctx);
     printf("%s: %.0f vertices, %.0f triangles, %.2f seconds\n", path, (double)mesh->vertex_count,

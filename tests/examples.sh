@@ -51,6 +51,7 @@ fit_says() {
 }
 expect a_fit_that_diverges_says_so fit_says 10 1
 expect a_fit_that_falls_says_no_such_thing fit_says 0.01 0
+expect two_photos_are_enough "$work/fit_photos" --views 2 --size 24x24 --iterations 6 --out "$work/two"
 # What cannot be done is refused with a sentence, and nothing else happens: NAME WORDS COMMAND...
 refuses() {
     refused=$1 words=$2
@@ -81,9 +82,11 @@ refuses weights_below_0 "must not be negative" "$work/fit_depth" --demo --weight
 refuses a_demo_of_a_family_without_demo "they mean nothing" "$work/fit_depth" --demo-family planes --target 0 --out "$work/x"
 refuses two_observations "two observations" "$work/fit_photos" --photos none.txt --target 1 --out "$work/x"
 refuses starts_off_below_0 "0 to 180 degrees" "$work/fit_pose" --off -1,0 --out "$work/x"
+refuses weights_of_no_code "there is no code" "$work/fit_pose" --weights 1,1,5 --out "$work/x"
 refuses starts_off_too_far "a distance of 0 to 1000" "$work/fit_pose" --off 5,1e9 --out "$work/x"
 refuses a_fit_of_what_is_not_seen "nothing to fit" "$work/fit_depth" --demo --no-mask --weights 0,1,0 --out "$work/x"
 refuses a_code_that_is_no_word "no INDEX" "$work/render" embedded --code nan --out "$work/x"
+refuses a_mesh_where_none_can_be "cannot be written" "$work/mesh" embedded --out "$work/render/x.ply"
 refuses a_folder_as_a_stem "is a folder" "$work/render" embedded --out "$work"
 refuses options_without_effect "belongs to" "$work/fit_photos" --mesh-cells 20 --out "$work/x"
 refuses starts_of_no_similarity "where --similarity starts" "$work/fit_photos" --off 5,5,0.1 --out "$work/x"

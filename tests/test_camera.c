@@ -345,6 +345,13 @@ TEST(moves_there_and_back_return)
     CHECK_NEAR_ARRAY(9, before.rotation, c.rotation, 2e-5);
     dist_camera_move(&c, NULL, NULL);
     dist_camera_move(NULL, w, w);
+    before = c;
+    for (int k = 0; k < 6; k++) { /* what is not finite moves nothing, the rest of the step neither */
+        float wrong[6] = {0.1f, 0.1f, 0.1f, 0.1f, 0.1f, 0.1f};
+        wrong[k] = k & 1 ? INFINITY : NAN;
+        dist_camera_move(&c, wrong, wrong + 3);
+        CHECK(memcmp(&before, &c, sizeof c) == 0);
+    }
 }
 
 /* Rows 28 to 30: what is refused, and that what is close enough is not. */

@@ -167,6 +167,29 @@ static void stretch(dist_context *ctx, dist_net *net, float factor)
     free(w);
 }
 
+/* As where every block of points holds one that overflows. */
+static void alone_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    (void)worker, (void)points, (void)gradient;
+    for (size_t i = 0; i < n; i++) sdf[i] = n > 1 ? 1.0f : *(const float *)user;
+}
+
+TEST(what_16_bits_are_off_is_measured_point_by_point_where_no_block_tells)
+{
+    float points[3 * DISTI_BLOCK] = {0}, sdf[DISTI_BLOCK], alone = 1.25f;
+    dist_field field;
+    memset(&field, 0, sizeof field);
+    field.user = &alone;
+    field.coarse_fn = alone_eval;
+    for (size_t i = 0; i < DISTI_BLOCK; i++) sdf[i] = 1.0f;
+    CHECK_EQUAL(0.25f, disti_coarse_apart(&field, points, sdf));
+    sdf[7] = 0.5f; /* a block that tells is enough */
+    CHECK_EQUAL(0.5f, disti_coarse_apart(&field, points, sdf));
+    alone = INFINITY;
+    sdf[7] = 1.0f;
+    CHECK_EQUAL(0.0f, disti_coarse_apart(&field, points, sdf));
+}
+
 TEST(blocks_that_overflow_f16_are_evaluated_in_f32)
 {
     float points[3 * POINTS], sdf[POINTS], half[POINTS];
@@ -516,6 +539,7 @@ int main(int argc, char **argv)
     test_begin(argc, argv);
     RUN(every_form_of_file_in_16_bits_is_within_its_bound_and_the_same_bits_in_every_batch);
     RUN(ragged_widths_in_16_bits);
+    RUN(what_16_bits_are_off_is_measured_point_by_point_where_no_block_tells);
     RUN(blocks_that_overflow_f16_are_evaluated_in_f32);
     RUN(blocks_of_bf16_with_a_sum_that_is_not_finite_are_evaluated_in_f32);
     RUN(new_weights_are_packed_again_gradients_stay_exact_and_off_is_f32);

@@ -1048,6 +1048,47 @@ TEST(the_least_numbers_a_file_may_say_are_floats)
     REFUSED(DIST_BAD_FILE, "dist.activation", "\"dist.activation\":\"sine:9.9999e-7\"", good_tensors);
 }
 
+/* In place, all of the header's. Both are of the same length. */
+static void rename_all(unsigned char *bytes, size_t size, const char *from, const char *to)
+{
+    size_t n = strlen(from);
+    for (size_t i = 0; i + n <= size; i++)
+        if (memcmp(bytes + i, from, n) == 0) memcpy(bytes + i, to, n);
+}
+
+/* DeepSDF's decoder calls it bnK, and its files say nothing about it. */
+TEST(layer_norm_that_only_its_tensors_tell_of_is_not_left_out)
+{
+    model_desc desc = {.normed = 1, .code_size = 3, .skip = 4};
+    model m = model_make(&desc, 3);
+    float points[30], code[3] = {0.2f, -0.1f, 0.4f}, sdf[2][10];
+    test_random random = test_random_seed(5);
+    test_random_fill(&random, 30, points, -0.7f, 0.7f);
+    for (int k = 0; k < 4; k++) { /* as it is, without metadata, by the other name, and by that with metadata */
+        dist_context *ctx = test_context();
+        size_t size;
+        unsigned char *bytes = model_file(&m, &size);
+        if (k == 1 || k == 2) rename_all(bytes, size, "\"dist.norm\"", "\"other.key\"");
+        if (k > 1) rename_all(bytes, size, "\"norm", "  \"bn");
+        dist_net *net = dist_net_load(ctx, bytes, size);
+        dist_shape *shape = dist_shape_create(ctx, net, code);
+        dist_field field = dist_shape_field(shape);
+        CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &field, 10, points, sdf[k > 0], NULL), ctx);
+        CHECK(memcmp(sdf[0], sdf[k > 0], sizeof sdf[0]) == 0);
+        CHECK_EQUAL(m.count, dist_net_weight_count(net));
+        free(bytes);
+        dist_shape_destroy(shape);
+        dist_net_destroy(net);
+        dist_context_destroy(ctx);
+    }
+    model_free(&m);
+    const char *some = "lin0.weight 4 5;lin0.bias 4;lin1.weight 4 4;lin1.bias 4;lin2.weight 1 4;lin2.bias 1;"
+                       "bn1.weight 4;bn1.bias 4;";
+    REFUSED(DIST_BAD_FILE, "norm weight of layer 0 is missing", "", some);
+    REFUSED(DIST_UNSUPPORTED, "bn0.running_mean is of a batch normalization", "",
+            "lin0.weight 4 5;lin0.bias 4;bn0.weight 4;bn0.bias 4;bn0.running_mean 4;lin1.weight 1 4;lin1.bias 1;");
+}
+
 TEST(tensors_that_do_not_fit_are_refused_with_a_sentence)
 {
     REFUSED(DIST_BAD_FILE, "bias", "", "lin0.weight 4 5;lin0.bias 4;lin1.weight 1 4;");
@@ -1132,6 +1173,14 @@ TEST(metadata_that_means_nothing_is_refused_with_a_sentence)
         char meta[128];
         snprintf(meta, sizeof meta, "\"%s\":\"%s\"", wrong[k][0], wrong[k][1]);
         REFUSED(DIST_BAD_FILE, wrong[k][0], meta, good_tensors);
+    }
+    static const char *const unknown[] = {"dist.activaton", "dist.Norm", "dist.", "dist.skip_", "dist.norm.",
+                                          "dist.raw"};
+    for (size_t k = 0; k < sizeof unknown / sizeof unknown[0]; k++) {
+        char meta[64], part[64];
+        snprintf(meta, sizeof meta, "\"%s\":\"none\"", unknown[k]);
+        snprintf(part, sizeof part, "%s is not known", unknown[k]);
+        REFUSED(DIST_BAD_FILE, part, meta, good_tensors);
     }
     REFUSED(DIST_BAD_FILE, "layer 0 takes 5", "\"dist.code_size\":\"3\"", good_tensors);
     REFUSED(DIST_BAD_FILE, "4 wide", "\"dist.skip\":\"1\"", good_tensors);
@@ -1544,6 +1593,7 @@ int main(int argc, char **argv)
     RUN(channels_that_end_the_header_are_read_no_further);
     RUN(spaces_around_the_channels_names_are_none_of_theirs);
     RUN(the_least_numbers_a_file_may_say_are_floats);
+    RUN(layer_norm_that_only_its_tensors_tell_of_is_not_left_out);
     RUN(tensors_that_do_not_fit_are_refused_with_a_sentence);
     RUN(a_layer_missing_in_the_middle_is_refused);
     RUN(a_net_of_more_layers_than_there_can_be_is_refused);

@@ -533,6 +533,25 @@ TEST(photos_may_differ_in_size_and_be_one_pixel_wide)
     CHECK(dist_loss_photometric(&c.to, &big_photo, NULL, 1.0f, d_depth, NULL) >= 0);
 }
 
+/* Also at its border, where rounding may put a pixel outside. */
+TEST(a_photo_sees_all_of_itself)
+{
+    static photo_case c;
+    static unsigned char visible[PIXELS];
+    test_random random = test_random_seed(11);
+    photo_fill(&c, 71);
+    for (int pose = 0; pose < 100; pose++) {
+        float move[6];
+        dist_photometric_desc desc;
+        memset(&desc, 0, sizeof desc);
+        desc.visible = visible;
+        test_random_fill(&random, 6, move, -0.1f, 0.1f);
+        dist_camera_move(&c.to.camera, move, move + 3);
+        CHECK_NEAR(0, dist_loss_photometric(&c.to, &c.to, &desc, 1.0f, NULL, NULL), 1e-6);
+        CHECK(memcmp(c.mask_to, visible, sizeof visible) == 0);
+    }
+}
+
 /* The baseline of fit_photos: depth of a mesh in place of the rays'. */
 TEST(raster_depth_of_a_mesh_is_that_of_the_rays)
 {
@@ -636,6 +655,7 @@ int main(int argc, char **argv)
     RUN(what_the_other_view_cannot_see_does_not_count);
     RUN(photometric_loss_of_bad_arguments_is_zero);
     RUN(photos_may_differ_in_size_and_be_one_pixel_wide);
+    RUN(a_photo_sees_all_of_itself);
     RUN(raster_depth_of_a_mesh_is_that_of_the_rays);
     RUN(raster_gradient_is_the_central_difference_of_its_depth);
     return test_report();

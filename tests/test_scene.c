@@ -974,6 +974,13 @@ TEST(moving_a_placement_keeps_it_a_similarity)
     CHECK_NEAR(1, s.rotation[4], 0);
     dist_similarity_move(NULL, step);
     dist_similarity_move(&s, NULL);
+    for (int k = 0; k < 7; k++) { /* what is not finite moves nothing, the rest of the step neither */
+        dist_similarity before = s;
+        float wrong[7] = {0.1f, 0.1f, 0.1f, 0.1f, 0.1f, 0.1f, 0.1f};
+        wrong[k] = k & 1 ? INFINITY : NAN;
+        dist_similarity_move(&s, wrong);
+        CHECK(memcmp(&before, &s, sizeof s) == 0);
+    }
     for (int k = 0; k < 3; k++) { /* never 0, which would mean 1 */
         float far[7] = {k == 1 ? 1000.0f : -1000.0f, 0, 0, 0, 0, 0, 0};
         dist_similarity_move(&s, far);

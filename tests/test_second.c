@@ -710,6 +710,18 @@ TEST(eikonal_gradients_have_the_same_bits_for_every_number_of_workers)
     }
 }
 
+/* A net that overflows: f is NaN there, its gradient 0. */
+static void blind_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    uint32_t bits = 0x7fc00000u;
+    cone_eval(user, worker, n, points, sdf, gradient);
+    for (size_t i = 0; i < n; i++) {
+        if (points[3 * i] > 0.0f) continue;
+        memcpy(&sdf[i], &bits, sizeof bits);
+        for (size_t k = 0; gradient && k < 3; k++) gradient[3 * i + k] = 0.0f;
+    }
+}
+
 TEST(eikonal_of_points_that_are_not_finite_is_left_out_and_nonsense_refused)
 {
     float numbers[2] = {2.0f, 0.5f}, code[2] = {0}, three[3] = {0}, loss = 0.0f;
@@ -726,6 +738,10 @@ TEST(eikonal_of_points_that_are_not_finite_is_left_out_and_nonsense_refused)
     CHECK_NEAR(2.0, (double)loss, 1e-5);
     CHECK_STATUS(DIST_OK, dist_field_eikonal(ctx, &field, 0, NULL, 3.0f, &loss, NULL), ctx);
     CHECK_NEAR(0.0, (double)loss, 0);
+    field.eval_fn = blind_eval;
+    CHECK_STATUS(DIST_OK, dist_field_eikonal(ctx, &field, 2, good, 3.0f, &loss, NULL), ctx);
+    CHECK_NEAR(1.5, (double)loss, 1e-5); /* of the first point alone */
+    field.eval_fn = cone_eval;
     loss = 7.0f; /* what errors leave alone */
     CHECK_EQUAL(DIST_BAD_ARGUMENT, dist_field_eikonal(ctx, &field, 2, NULL, 1.0f, &loss, NULL));
     CHECK_EQUAL(DIST_BAD_ARGUMENT, dist_field_eikonal(ctx, NULL, 2, good, 1.0f, &loss, NULL));

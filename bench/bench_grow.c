@@ -622,12 +622,14 @@ int main(int argc, char **argv)
 {
     settings set = {NULL, NULL, 1, 0, 0};
     table t = {NULL, 0};
+    char path[PATH_SIZE];
     options o = options_begin(argc, argv, usage);
     while (option_next(&o)) {
         if (option_is(&o, "--sweep")) {
             set.sweep = option_text(&o);
         } else if (option_is(&o, "--svg")) {
             set.svg = option_text(&o);
+            check_path(path_of(path, set.svg, ".svg"));
         } else if (option_is(&o, "--threads")) {
             set.threads = option_int(&o, 1, 256);
         } else if (option_is(&o, "--runs")) {

@@ -1508,6 +1508,7 @@ static int next_case(queue *q, int thread)
 int main(int argc, char **argv)
 {
     const char *only = NULL;
+    char path[PATH_SIZE];
     int only_size = 0, largest = 0, workers = 1, at_once = 1, list = 0;
     sweep common;
     queue cases;
@@ -1533,6 +1534,7 @@ int main(int argc, char **argv)
             common.have = (const char *)read_file(option_text(&o), &bytes);
         } else if (option_is(&o, "--svg")) {
             common.svg = option_text(&o);
+            check_path(path_of(path, common.svg, ".svg"));
         } else if (option_is(&o, "--workers")) {
             workers = option_int(&o, 1, 256);
         } else if (option_is(&o, "--at-once")) {

@@ -18,6 +18,24 @@ typedef struct results {
     "  --out DIR          folder of what is written (default bench/results)\n"        \
     "  --quick            small pictures, few cases: seconds, to see that all works\n"
 
+/* DIR/NAME, without an ending: good until the next call. */
+static inline const char *results_stem(const results *r, const char *name)
+{
+    static char stem[PATH_SIZE];
+    char path[PATH_SIZE];
+    path_of(path, r->out, "/");
+    path_of(stem, path, name);
+    make_folders(stem);
+    return stem;
+}
+
+/* Tries whether the folder can be written to: better known before the work than after. */
+static inline void results_check(const results *r)
+{
+    char path[PATH_SIZE];
+    check_path(path_of(path, results_stem(r, "RESULTS"), ".md"));
+}
+
 static inline results results_options(int argc, char **argv, const char *help)
 {
     results r;
@@ -35,23 +53,13 @@ static inline results results_options(int argc, char **argv, const char *help)
             option_unknown(&o);
         }
     }
+    results_check(&r);
     return r;
 }
 
 static inline int results_wanted(const results *r, const char *name)
 {
     return !r->only || strcmp(r->only, name) == 0;
-}
-
-/* DIR/NAME, without an ending: good until the next call. */
-static inline const char *results_stem(const results *r, const char *name)
-{
-    static char stem[PATH_SIZE];
-    char path[PATH_SIZE];
-    path_of(path, r->out, "/");
-    path_of(stem, path, name);
-    make_folders(stem);
-    return stem;
 }
 
 /* Processor with family and model, cores, compiler, and the commit if results.sh told it. */

@@ -1172,6 +1172,7 @@ int main(int argc, char **argv)
             option_unknown(&o);
         }
     }
+    results_check(&s.r);
     if (!s.shapes) { s.shapes = s.r.quick ? 2 : 20; }
     if (!s.size) { s.size = s.r.quick ? 40 : 96; }
     if (s.r.quick) { s.iterations = 20; }

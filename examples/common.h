@@ -149,9 +149,18 @@ typedef struct options {
     char name[PATH_SIZE];
 } options;
 
+/* At a program's end: what was printed has arrived, or it has failed. */
+static inline void finish_printing(void)
+{
+    if (fflush(stdout) == 0 && !ferror(stdout)) { return; }
+    fputs("what was printed cannot be written in full\n", stderr);
+    _Exit(2);
+}
+
 static inline options options_begin(int argc, char **argv, const char *usage)
 {
     options o;
+    atexit(finish_printing);
     memset(&o, 0, sizeof o);
     o.argc = argc;
     o.argv = argv;

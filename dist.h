@@ -318,7 +318,7 @@ typedef struct dist_similarity {
 
 /* scale *= exp(step[0]) (within 1e-30 to 1e30; one below 0 stays), rotation <- exp([step[1..3]]x) rotation, kept
    orthonormal, translation += step[4..6]: the step for a gradient of a placement's seven numbers, against it as in
-   dist_camera_move. */
+   dist_camera_move. One that is not finite moves nothing. */
 DIST_API void dist_similarity_move(dist_similarity *placement, const float step[7]);
 
 /* A field and where it stands. */
@@ -329,10 +329,10 @@ typedef struct dist_instance {
 
 /* Several instances as one field: f(p) = min over i of s_i f_i(R_i^T (p - t_i) / s_i). A point asks only the instances
    whose bounding spheres can hold the minimum, nearest first, and none of them outside its sphere: there f_i goes on as
-   a lower bound of the distance, exact up to a fifth of the sphere's radius. The defaults
-   of how.epsilon and normal_delta go by the smallest instance's radius in the world, but are no smaller than float's
-   noise, 5e-7 of the scene's. Every point is held against every sphere: fast up to some hundred instances; more are
-   better made scenes of scenes. Belongs to the context that made it. */
+   a lower bound of the distance, exact up to a fifth of the sphere's radius. The defaults of how.epsilon and
+   normal_delta go by the smallest instance's radius in the world, but are no smaller than float's noise, 5e-7 of the
+   scene's. Every point is held against every sphere: fast up to some hundred instances; more are better made scenes of
+   scenes. Belongs to the context that made it. */
 typedef struct dist_scene dist_scene;
 /* NULL on failure. Instances may share fields; a scene's field may be an instance of another scene. Takes 264 bytes for
    each number of the scene's code, for sums of its gradient. */
@@ -345,9 +345,9 @@ DIST_API dist_status dist_scene_set(dist_scene *scene, int index, const dist_ins
 /* The scene as a field. Borrows the scene. No gradient for weights. Its code is, for each instance, its field's code
    (nothing if that has no adjoint), then its placement as dist_similarity_move has it: log-scale, w of
    R' = exp([w]x) R, translation; dist_gradients.code gets the gradients for all of them, with the bounding spheres of
-   scenes held where they are, which matters outside of those alone. It has a color if every
-   instance has, with an adjoint if each has one; its color code is theirs one after another. The gradient of its
-   normals is that of differences over how.normal_delta, of smooth nets, too. */
+   scenes held where they are, which matters outside of those alone. It has a color if every instance has, with an
+   adjoint if each has one; its color code is theirs one after another. The gradient of its normals is that of
+   differences over how.normal_delta, of smooth nets, too. */
 DIST_API dist_field dist_scene_field(dist_scene *scene);
 /* Where instance `index` begins in the scene's code; its placement are the seven numbers before instance index + 1.
    index = count: all of them. -1 out of range. */
@@ -397,8 +397,8 @@ enum {
    the bounding sphere when the shape is made: a sample, not a proof. The point's columns and the last layer stay in
    f32; a block in which anything overflows is evaluated in f32. DIST_UNSUPPORTED: a processor or build without these
    instructions, LayerNorm, weights beyond 65504 in F16 (set later, they turn it off); then, and on contexts of another
-   isa than DIST_ISA_AVX512, coarse_fn is NULL: dist_context_clear, where f32 will do. No shape of the net
-   may be in use by another thread. */
+   isa than DIST_ISA_AVX512, coarse_fn is NULL: dist_context_clear, where f32 will do. No shape of the net may be in
+   use by another thread. */
 DIST_API dist_status dist_net_set_half(dist_context *ctx, dist_net *net, int kind);
 /* What is in force: DIST_HALF_OFF, F16 or BF16. */
 DIST_API int dist_net_half(const dist_net *net);
@@ -4264,7 +4264,7 @@ static dist_status disti_field_check(dist_context *ctx, const dist_field *field,
 
 enum { DISTI_CHUNK = DISTI_SLOTS * 4 * DISTI_BLOCK }; /* points of a backward pass held at once */
 
-/* Work is cut into pieces of whole kernel blocks, at most 2^30 of them: the count follows from n alone. */
+/* Work is cut into pieces of whole kernel blocks, at most 2^30 of them: how does not depend on the workers. */
 typedef struct disti_pieces {
     size_t n, size;
     int count;
@@ -8828,7 +8828,7 @@ static dist_status disti_loader_keys(disti_loader *loader)
         "|activation|output|input|skip|skip_order|skip_scale|encoding|encoding.levels|encoding.base|encoding.raw|"
         "encoding.order|norm|norm.epsilon|level|code_size|channels|bound|clamp|";
     for (size_t i = 0; i < loader->archive.meta_count; i++) {
-        const char *key = loader->archive.keys[i], *at = known;
+        const char *key = loader->archive.keys[i], *at = strchr(key, '|') ? "" : known;
         size_t n = strlen(key);
         if (n < 5 || memcmp(key, "dist.", 5) != 0) continue;
         n -= 5;

@@ -1175,7 +1175,7 @@ TEST(metadata_that_means_nothing_is_refused_with_a_sentence)
         REFUSED(DIST_BAD_FILE, wrong[k][0], meta, good_tensors);
     }
     static const char *const unknown[] = {"dist.activaton", "dist.Norm", "dist.", "dist.skip_", "dist.norm.",
-                                          "dist.raw"};
+                                          "dist.raw", "dist.norm|norm.epsilon"};
     for (size_t k = 0; k < sizeof unknown / sizeof unknown[0]; k++) {
         char meta[64], part[64];
         snprintf(meta, sizeof meta, "\"%s\":\"none\"", unknown[k]);

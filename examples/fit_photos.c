@@ -148,7 +148,7 @@ static void take_photo(fit *f, const dist_field *field, view_data *v)
     free(out.mask);
 }
 
-static void view_take(fit *f, view_data *v)
+static void view_take(fit *f, view_data *v, const char *name)
 {
     size_t n = pixel_count(v);
     if (!v->photo) { v->photo = take_floats(3 * n); }
@@ -158,7 +158,7 @@ static void view_take(fit *f, view_data *v)
     v->mask = (unsigned char *)take(n, 1);
     v->triangle = (unsigned *)take(n, sizeof *v->triangle);
     v->tape = dist_tape_create(f->ctx, &v->camera, &f->how);
-    check(f->ctx);
+    if (dist_context_status(f->ctx) != DIST_OK) { fail("%s: %s", name, dist_context_message(f->ctx)); }
 }
 
 /* Cameras around the shape, higher and lower by turns so that more of it is seen than from one height. */
@@ -176,7 +176,7 @@ static void take_photos(fit *f, const dist_field *field)
         look.eye[2] = 0.0f;
         look.fov = o->fov;
         f->views[i].camera = view_camera(&look, turn);
-        view_take(f, &f->views[i]);
+        view_take(f, &f->views[i], "a photo");
         take_photo(f, field, &f->views[i]);
     }
 }
@@ -242,7 +242,7 @@ static void read_photos(fit *f)
         f->views = (view_data *)realloc(f->views, (f->view_count + 1) * sizeof v);
         if (!f->views) { fail("out of memory"); }
         f->views[f->view_count] = v;
-        view_take(f, &f->views[f->view_count++]);
+        view_take(f, &f->views[f->view_count++], name + 1);
     }
     free(text);
     if (f->view_count < 2) { fail("%s names %.0f photos; two are needed", path, (double)f->view_count); }

@@ -4496,8 +4496,8 @@ static void disti_backward_run(dist_context *ctx, disti_backward_job *job, size_
 {
     size_t size = (size_t)job->field->code_size;
     if (n == 0) return;
-    int small = job->field->cost > 0.0f && job->field->cost < 5e4f; /* to which its code's sums add a few percent */
-    job->pieces = disti_cut(n, (small ? 8 : 4) * DISTI_BLOCK, DISTI_SLOTS);
+    int cheap = job->field->cost > 0.0f && job->field->cost < 5e4f; /* to which its code's sums add a few percent */
+    job->pieces = disti_cut(n, (cheap ? 8 : 4) * DISTI_BLOCK, DISTI_SLOTS);
     job->d_code = d_code ? ctx->partial : NULL;
     if (d_code) memset(ctx->partial, 0, (size_t)job->pieces.count * size * sizeof(double));
     disti_run(ctx, job->pieces.count, disti_backward_task, job);

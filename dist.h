@@ -17215,7 +17215,11 @@ static dist_mesh *disti_mesh_parse(dist_context *ctx, const char *label, const v
     } else {
         size_t prefix = size > 4 && text[0] == 'C' ? 1 : 0; /* C: colors, N: normals behind the coordinates */
         prefix += size > 4 + prefix && text[prefix] == 'N';
-        int off = size > 3 + prefix && memcmp(text + prefix, "OFF", 3) == 0 && disti_is_space(text[prefix + 3]);
+        int off = size > 3 + prefix && memcmp(text + prefix, "OFF", 3) == 0;
+        if (off) { /* ModelNet's files may have the first count at the word: OFF490 518 0 */
+            char next = text[prefix + 3];
+            off = disti_is_space(next) || (next >= '0' && next <= '9');
+        }
         if (off) r.text.at += prefix + 3;
         good = off ? disti_read_off(&r) : disti_read_obj(&r);
     }

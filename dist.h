@@ -5427,7 +5427,7 @@ DIST_API dist_field dist_scene_field(dist_scene *scene)
     field.color_adjoint_fn = disti_scene_color_adjoint;
     field.code_size = (int)scene->code_size;
     field.color_code_size = (int)scene->color_code_size;
-    field.lipschitz = 1.0f;
+    field.lipschitz = field.lipschitz_far = 1.0f; /* phi outside the spheres, however flat the instances are */
     field.radius = disti_scene_bound(scene, field.center);
     int known = 1; /* what each instance costs */
     for (int k = 0; k < scene->count; k++) {

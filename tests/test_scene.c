@@ -1394,6 +1394,61 @@ TEST(the_figures_of_an_instance_hold_no_farther_out_in_a_large_scene)
     dist_context_destroy(ctx);
 }
 
+/* A thin shell of radius .9 around a ball, with |grad f| the number that user points to everywhere. */
+static void flat_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    float slope = *(const float *)user;
+    (void)worker;
+    for (size_t i = 0; i < n; i++, points += 3) {
+        float length = (float)shape_length((double)points[0], (double)points[1], (double)points[2]);
+        float shell = fabsf(length - 0.9f) - 5e-3f, ball = length - 0.3f;
+        float outward = shell < ball && length < 0.9f ? -slope : slope;
+        sdf[i] = slope * (shell < ball ? shell : ball);
+        for (size_t k = 0; gradient && k < 3; k++) gradient[3 * i + k] = length > 0 ? outward * points[k] / length : 0;
+    }
+}
+
+/* Between its instances' spheres a scene is a distance, however flat they are. */
+TEST(a_flat_field_loses_nothing_in_a_scene)
+{
+    enum { SMALL_SIDE = 64, SMALL = SMALL_SIDE * SMALL_SIDE };
+    static const float slopes[4] = {1.0f, 0.7f, 0.2f, 0.05f};
+    dist_context *ctx = test_context();
+    const float eye[3] = {2, 1, 3}, at[3] = {0, 0, 0}, up[3] = {0, 1, 0};
+    dist_camera camera = dist_camera_look_at(SMALL_SIDE, SMALL_SIDE, 0.6f, eye, at, up);
+    for (int i = 0; i < 16; i++) {
+        static float depth[2][SMALL];
+        static unsigned char mask[2][SMALL];
+        float slope = slopes[i / 4];
+        dist_field flat;
+        dist_instance one;
+        dist_render_desc how;
+        memset(&flat, 0, sizeof flat);
+        memset(&one, 0, sizeof one);
+        memset(&how, 0, sizeof how);
+        flat.user = &slope;
+        flat.eval_fn = flat_eval;
+        flat.radius = 1;
+        flat.lipschitz = slope;
+        one.field = &flat;
+        how.certified = i & 1;
+        how.no_cones = i >> 1 & 1;
+        dist_scene *scene = dist_scene_create(ctx, 1, &one);
+        dist_field fields[2] = {flat, dist_scene_field(scene)};
+        for (int k = 0; k < 2; k++) {
+            dist_images out;
+            memset(&out, 0, sizeof out);
+            out.depth = depth[k];
+            out.mask = mask[k];
+            CHECK_STATUS(DIST_OK, dist_render(ctx, &fields[k], &camera, &how, &out, NULL), ctx);
+        }
+        CHECK_BYTES(sizeof mask[0], mask[0], mask[1]);
+        CHECK_NEAR_ARRAY(SMALL, depth[0], depth[1], 5e-3);
+        dist_scene_destroy(scene);
+    }
+    dist_context_destroy(ctx);
+}
+
 TEST(only_create_takes_memory_and_a_failed_one_leaves_none)
 {
     test_allocator allocator;
@@ -1464,6 +1519,7 @@ int main(int argc, char **argv)
     RUN(colors_are_those_of_the_instance_that_is_hit);
     RUN(colors_outside_of_the_sphere_move_as_its_nearest_point_does);
     RUN(the_figures_of_an_instance_hold_no_farther_out_in_a_large_scene);
+    RUN(a_flat_field_loses_nothing_in_a_scene);
     RUN(only_create_takes_memory_and_a_failed_one_leaves_none);
     return test_report();
 }

@@ -612,7 +612,10 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
 /* The nearest point of the surface to each of n points, found from where |f| falls: steps along the gradient onto the
    surface, then along the surface as long as that brings it nearer, then a look around for nearer parts. Of a distance
    as far off as the nearest to within 1e-4 of the radius, 1e-3 from a radius outside the bounding sphere on, where one
-   point in thousands also ends on a part that is not the nearest; else mostly the nearest, at the least a local one.
+   point in thousands also ends on a part that is not the nearest; else mostly the nearest, at the least a local one:
+   where a decoder's f is no distance far from the surface, many points well outside the bounding sphere end on another
+   part, and large spheres of dist_field_collide that just touch are told to be clear. Outside a scene each instance is
+   gone to by itself that may be nearer; what is of one within another is no surface.
    closest (n, 3); distance (n) signed, below 0 inside, and status (n) may be NULL: DIST_RAY_HIT, DIST_RAY_UNRESOLVED
    (no surface found: the last point tried), DIST_RAY_NOT_FINITE. Nothing is asked outside the bounding sphere. */
 DIST_API dist_status dist_field_closest_point(dist_context *ctx, const dist_field *field, size_t n,
@@ -4754,7 +4757,8 @@ static float disti_steepest(const dist_field *field)
      d <= 0      b = f(q)
      0 < d       b = sqrt(d^2 + v^2),  v = max(f(c + r n), 0),  n = (q - c) / |q - c|      (a ball is convex)
      phi         min(b, m + |d - m|): continuous, no steeper than f or 1, b itself wherever b < m, and d where d >= m,
-                 which needs no query
+                 which needs no query. It falls outward from the sphere to where d = m: who follows its gradient ends
+                 there, and asks for all of b instead (disti_scene_whole: m without end)
      scene       f(p) = min_i f_i(p): in order of d, instances are asked while s d is below the least value so far
 
    backward    grad f_i = R grad phi
@@ -4789,6 +4793,7 @@ enum { DISTI_SCENE_CHUNK = 2048, DISTI_SCENE_PIECE = DISTI_BLOCK, DISTI_CONTESTE
 /* A worker's share of a scene's memory, for a chunk of points. */
 typedef struct disti_scene_work {
     unsigned long long *queries;
+    int *whole;    /* 1: b is wanted everywhere, 2 + k: of instance k alone */
     int *start;    /* (count + 1): of each instance's group in order, point */
     int *order;    /* points by instance */
     float *local;  /* (n, 3): what is asked, by instance */
@@ -4806,6 +4811,7 @@ static size_t disti_scene_layout(const dist_scene *scene, unsigned char *base, d
 {
     size_t at = 0, n = DISTI_SCENE_CHUNK;
     w->queries = (unsigned long long *)disti_take(base, &at, 1, sizeof(unsigned long long));
+    w->whole = (int *)disti_take(base, &at, 1, sizeof(int));
     w->start = (int *)disti_take(base, &at, (size_t)scene->count + 1, sizeof(int));
     w->order = (int *)disti_take(base, &at, n, sizeof(int));
     w->local = (float *)disti_take(base, &at, n, 3 * sizeof(float));
@@ -4857,21 +4863,26 @@ static void disti_placed_unproject(const disti_placed *placed, const float *p, f
     for (int i = 0; i < 3; i++) y[i] = radius / away * (y[i] - along * n[i] / away);
 }
 
-/* f_i at p, d from the sphere in the world, where the field answered f. */
-static float disti_placed_value(const disti_placed *placed, const disti_ball *ball, float d, float f)
+static float disti_scene_margin(const disti_scene_work *w, const disti_ball *ball)
 {
-    float b = placed->scale * f, m = ball->margin;
+    return *w->whole ? 1e18f : ball->margin;
+}
+
+/* f_i at p, d from the sphere in the world, where the field answered f; m: the margin. */
+static float disti_placed_value(const disti_placed *placed, float m, float d, float f)
+{
+    float b = placed->scale * f;
     if (!disti_finite(b)) return b;
     if (d > 0.0f) b = sqrtf(d * d + DISTI_MAX(b, 0.0f) * DISTI_MAX(b, 0.0f));
     return DISTI_MIN(b, m + (d > m ? d - m : m - d));
 }
 
 /* The same with its gradient, from g = grad f, and weight = df_i/df. */
-static float disti_placed_gradient(const disti_placed *placed, const disti_ball *ball, const float *p, float d, float f,
-                                   const float *g, float *gradient, float *weight)
+static float disti_placed_gradient(const disti_placed *placed, const disti_ball *ball, float margin, const float *p,
+                                   float d, float f, const float *g, float *gradient, float *weight)
 {
     const float *m = placed->rotation;
-    float n[3], v = DISTI_MAX(placed->scale * f, 0.0f), value = disti_placed_value(placed, ball, d, f), along = 0.0f;
+    float n[3], v = DISTI_MAX(placed->scale * f, 0.0f), value = disti_placed_value(placed, margin, d, f), along = 0.0f;
     float length = DISTI_MAX(d + ball->radius, 1e-30f);
     *weight = placed->scale;
     for (int i = 0; i < 3; i++) {
@@ -4880,8 +4891,8 @@ static float disti_placed_gradient(const disti_placed *placed, const disti_ball 
         along += n[i] * gradient[i];
     }
     if (!disti_finite(value)) return value;
-    float b = d > 0.0f ? sqrtf(d * d + v * v) : placed->scale * f, beside = d - ball->margin;
-    if (b > ball->margin + fabsf(beside)) {
+    float b = d > 0.0f ? sqrtf(d * d + v * v) : placed->scale * f, beside = d - margin;
+    if (b > margin + fabsf(beside)) {
         *weight = 0.0f;
         for (int i = 0; i < 3; i++) gradient[i] = beside > 0.0f ? n[i] : -n[i];
     } else if (d > 0.0f) {
@@ -4900,7 +4911,8 @@ static void disti_scene_next(const dist_scene *scene, const float *p, disti_scen
     w->choice[i] = -1;
     for (int k = 0; k < scene->count; k++) {
         float d = disti_ball_distance(&scene->ball[k], p);
-        if (!(d < least) || d >= scene->ball[k].margin || d < after || (d <= after && k <= last)) continue;
+        float m = disti_scene_margin(w, &scene->ball[k]);
+        if (!(d < least) || d >= m || d < after || (d <= after && k <= last)) continue;
         w->choice[i] = k;
         w->lower[i] = least = d;
     }
@@ -4911,16 +4923,18 @@ static void disti_scene_next(const dist_scene *scene, const float *p, disti_scen
 static int disti_scene_begin(const dist_scene *scene, const float *p, disti_scene_work *w, size_t i, int hint)
 {
     float best = 3e38f, first = 3e38f, second = 3e38f, limit = 1e18f;
+    int alone = *w->whole >= 2, count = alone ? 0 : scene->count;
+    if (alone) hint = *w->whole - 2;
     w->choice[i] = -1;
     w->winner[i] = hint;
     w->asked[i] = 0;
-    for (int k = -1; k < scene->count; k++) {
+    for (int k = -1; k < count; k++) {
         int at = k < 0 ? hint : k;
         const disti_ball *ball = &scene->ball[at];
         float x = p[0] - ball->center[0], y = p[1] - ball->center[1], z = p[2] - ball->center[2];
         float square = x * x + y * y + z * z, reach = limit + ball->radius;
         if (square >= reach * reach || k == hint) continue;
-        float d = disti_float(disti_float(sqrtf(square)) - ball->radius), m = ball->margin;
+        float d = disti_float(disti_float(sqrtf(square)) - ball->radius), m = disti_scene_margin(w, ball);
         if (d >= m) {
             if (d >= best) continue;
             best = d;
@@ -4976,7 +4990,8 @@ static void disti_scene_rounds(const dist_scene *scene, int worker, size_t n, co
         for (size_t at = 0; at < total; at++) {
             size_t i = (size_t)w->order[at];
             int k = w->choice[i];
-            float f = disti_placed_value(&scene->placed[k], &scene->ball[k], w->lower[i], w->value[at]);
+            float m = disti_scene_margin(w, &scene->ball[k]);
+            float f = disti_placed_value(&scene->placed[k], m, w->lower[i], w->value[at]);
             if (!disti_finite(f) || f < w->best[i]) {
                 w->best[i] = f;
                 w->winner[i] = k;
@@ -5079,8 +5094,9 @@ static void disti_scene_seed(void *user, size_t first, size_t count, const float
         size_t i = (size_t)w->order[link->group + first + j];
         float g[3], weight;
         int k = w->choice[i];
-        float f = disti_placed_gradient(&link->scene->placed[k], &link->scene->ball[k], link->points + 3 * i,
-                                        w->lower[i], sdf[j], gradient + 3 * j, g, &weight);
+        const disti_ball *ball = &link->scene->ball[k];
+        float f = disti_placed_gradient(&link->scene->placed[k], ball, disti_scene_margin(w, ball),
+                                        link->points + 3 * i, w->lower[i], sdf[j], gradient + 3 * j, g, &weight);
         d_sdf[j] = 0.0f;
         if (disti_finite(f) && f >= w->best[i]) disti_scene_emit_ball(link, i);
         else d_sdf[j] = weight * disti_scene_emit(link, i, k, f, g);
@@ -5126,6 +5142,40 @@ static void disti_scene_fused(void *user, int worker, size_t n, const float *poi
 static void disti_scene_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
 {
     disti_scene_fused(user, worker, n, points, sdf, gradient, NULL, NULL, NULL);
+}
+
+/* From now on the worker gets b of a scene, and of those in it, everywhere, or (whole 0) what is traced again. */
+static void disti_scene_whole(const dist_field *field, int worker, int whole)
+{
+    if (field->eval_fn != disti_scene_eval) return;
+    const dist_scene *scene = (const dist_scene *)field->user;
+    disti_scene_work w;
+    disti_scene_layout(scene, disti_scene_scratch(scene, worker), &w);
+    *w.whole = whole;
+    for (int k = 0; k < scene->count; k++) disti_scene_whole(&scene->placed[k].field, worker, whole);
+}
+
+/* Instances that are no scenes. */
+static int disti_scene_leaves(const dist_field *field)
+{
+    if (field->eval_fn != disti_scene_eval) return 1;
+    const dist_scene *scene = (const dist_scene *)field->user;
+    int leaves = 0;
+    for (int k = 0; k < scene->count; k++) leaves += disti_scene_leaves(&scene->placed[k].field);
+    return leaves;
+}
+
+/* From now on the worker gets b of that leaf alone. Returns the scene's instance that is it, or that it is in. */
+static int disti_scene_only(const dist_scene *scene, int worker, int leaf)
+{
+    disti_scene_work w;
+    int k = 0;
+    for (int more; leaf >= (more = disti_scene_leaves(&scene->placed[k].field)); k++) leaf -= more;
+    disti_scene_layout(scene, disti_scene_scratch(scene, worker), &w);
+    *w.whole = 2 + k;
+    const dist_field *field = &scene->placed[k].field;
+    if (field->eval_fn == disti_scene_eval) disti_scene_only((const dist_scene *)field->user, worker, leaf);
+    return k;
 }
 
 /* What a color's gradient needs. */
@@ -10886,7 +10936,8 @@ static int disti_skip(const disti_tracer *tracer, const disti_bench *bench, int 
     if (begins && ray->fb > 0.0f) return 1; /* it has been there */
     float s = begins ? ray->q : ray->s;
     if (bench->balls) s = disti_covered(bench, index, ray, s);
-    if (tracer->cache) s = disti_cache_walk(tracer, ray, s, begins ? s : ray->s + disti_empty(tracer, ray->f));
+    if (tracer->cache && ray->sign > 0.0f) /* on the way out what is empty is what it looks for */
+        s = disti_cache_walk(tracer, ray, s, begins ? s : ray->s + disti_empty(tracer, ray->f));
     if (s >= ray->leave) return disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest * ray->sign, 0.0f);
     if (s <= ray->q) return 1;
     ray->q = s;
@@ -11627,6 +11678,91 @@ typedef struct disti_foot_job {
     dist_contact *contacts;
 } disti_foot_job;
 
+/* Point i sets out. 0: it is done already. */
+static int disti_foot_begin(const disti_foot_job *job, size_t i, disti_foot *foot)
+{
+    const float *p = job->points + job->stride * i, zero[3] = {0.0f, 0.0f, 0.0f};
+    memset(foot, 0, sizeof *foot);
+    memcpy(foot->p, p, sizeof foot->p);
+    memcpy(foot->x, p, sizeof foot->x);
+    foot->distance = 3e38f;
+    foot->radius = job->contacts ? p[3] : 3e38f;
+    foot->damping = foot->relax = foot->sign = 1.0f;
+    foot->share = 0.5f;
+    foot->status = DIST_RAY_NOT_FINITE;
+    if (!disti_finite_all(job->stride, p)) return 0;
+    foot->away = disti_foot_move(job->field, foot->x, zero, 0.0f);
+    float clear[3] = {foot->away, 0.0f, 0.0f};
+    if (job->contacts && job->field->cache) clear[1] = disti_cache_clear(job->field->cache, foot->x);
+    float least = disti_foot_length(clear);
+    int clear_of = job->contacts && least > 0.0f && least >= foot->radius;
+    foot->status = (unsigned char)(clear_of ? DIST_RAY_MISS : DIST_RAY_UNRESOLVED);
+    if (clear_of) foot->distance = least;
+    return !clear_of;
+}
+
+/* Goes on until the `active` ones that bench->index lists have arrived. */
+static void disti_foot_rounds(const dist_field *field, int worker, const disti_bench *bench, disti_foot *feet,
+                              float *gradient, size_t active)
+{
+    while (active > 0) {
+        size_t kept = 0;
+        for (size_t i = 0; i < active; i++)
+            memcpy(bench->points + 3 * i, feet[bench->index[i]].x, 3 * sizeof(float));
+        field->eval_fn(field->user, worker, active, bench->points, bench->sdf, gradient);
+        for (size_t i = 0; i < active; i++)
+            if (disti_foot_advance(field, &feet[bench->index[i]], bench->sdf[i], gradient + 3 * i))
+                bench->index[kept++] = bench->index[i];
+        active = kept;
+    }
+}
+
+/* What points outside a scene of several found is the nearest of one instance, which f was least of; the others may
+   have nearer ones. So each goes to every other alone whose sphere is nearer than what it found, and takes what is
+   nearer there and not within a third. `others`: as many feet again. */
+static void disti_foot_others(const disti_foot_job *job, int worker, const disti_bench *bench, size_t first, size_t n,
+                              disti_foot *feet, disti_foot *others, float *gradient)
+{
+    const dist_field *field = job->field;
+    int leaves = disti_scene_leaves(field), owner[DISTI_FEET];
+    if (leaves < 2) return;
+    const dist_scene *scene = (const dist_scene *)field->user;
+    disti_scene_work w;
+    for (size_t i = 0; i < n; i++) memcpy(bench->points + 3 * i, feet[i].best, 3 * sizeof(float));
+    disti_scene_layout(scene, disti_scene_scratch(scene, worker), &w);
+    disti_scene_settle(scene, worker, n, bench->points, &w, 1);
+    memcpy(owner, w.winner, n * sizeof(int));
+    for (int leaf = 0; leaf < leaves; leaf++) {
+        int k = disti_scene_only(scene, worker, leaf), whole = disti_scene_leaves(&scene->placed[k].field) == 1;
+        size_t active = 0, found = 0;
+        for (size_t i = 0; i < n; i++) {
+            int hit = feet[i].status == DIST_RAY_HIT;
+            float within = hit ? feet[i].distance : feet[i].radius;
+            others[i].status = DIST_RAY_SKIPPED;
+            if ((!hit && feet[i].status != DIST_RAY_UNRESOLVED) || feet[i].sign < 0.0f) continue;
+            if (hit && whole && owner[i] == k) continue;
+            if (!(disti_ball_distance(&scene->ball[k], feet[i].p) < within)) continue;
+            if (disti_foot_begin(job, first + i, &others[i])) bench->index[active++] = (int)i;
+            others[i].radius = within;
+        }
+        disti_foot_rounds(field, worker, bench, others, gradient, active);
+        disti_scene_whole(field, worker, 1);
+        for (size_t i = 0; i < n; i++) {
+            if (others[i].status != DIST_RAY_HIT || !(others[i].distance < others[i].radius)) continue;
+            memcpy(bench->points + 3 * found, others[i].best, 3 * sizeof(float));
+            bench->index[found++] = (int)i;
+        }
+        if (found > 0) field->eval_fn(field->user, worker, found, bench->points, bench->sdf, NULL);
+        for (size_t j = 0; j < found; j++) {
+            size_t i = (size_t)bench->index[j];
+            if (!(bench->sdf[j] > -1e-4f * field->radius)) continue;
+            others[i].radius = feet[i].radius;
+            feet[i] = others[i];
+            owner[i] = k;
+        }
+    }
+}
+
 static void disti_foot_task(void *arg, int index, int worker)
 {
     const disti_foot_job *job = (const disti_foot_job *)arg;
@@ -11634,40 +11770,16 @@ static void disti_foot_task(void *arg, int index, int worker)
     const float zero[3] = {0.0f, 0.0f, 0.0f};
     disti_bench bench;
     disti_bench_init(job->ctx, worker, &bench);
-    disti_foot *feet = (disti_foot *)(void *)bench.rest;
-    float *gradient = (float *)(void *)(feet + DISTI_FEET);
+    DIST_ASSERT(DISTI_FEET * (2 * sizeof(disti_foot) + 3 * sizeof(float)) <= DISTI_REST_BYTES);
+    disti_foot *feet = (disti_foot *)(void *)bench.rest, *others = feet + DISTI_FEET;
+    float *gradient = (float *)(void *)(others + DISTI_FEET);
     size_t first = (size_t)index * DISTI_FEET, n = DISTI_MIN((size_t)DISTI_FEET, job->n - first), active = 0;
-    for (size_t i = 0; i < n; i++) {
-        disti_foot *foot = &feet[i];
-        const float *p = job->points + job->stride * (first + i);
-        memset(foot, 0, sizeof *foot);
-        memcpy(foot->p, p, sizeof foot->p);
-        memcpy(foot->x, p, sizeof foot->x);
-        foot->distance = 3e38f;
-        foot->radius = job->contacts ? p[3] : 3e38f;
-        foot->damping = foot->relax = foot->sign = 1.0f;
-        foot->share = 0.5f;
-        foot->status = DIST_RAY_NOT_FINITE;
-        if (!disti_finite_all(job->stride, p)) continue;
-        foot->away = disti_foot_move(field, foot->x, zero, 0.0f);
-        float clear[3] = {foot->away, 0.0f, 0.0f};
-        if (job->contacts && field->cache) clear[1] = disti_cache_clear(field->cache, foot->x);
-        float least = disti_foot_length(clear);
-        int clear_of = job->contacts && least > 0.0f && least >= foot->radius;
-        foot->status = (unsigned char)(clear_of ? DIST_RAY_MISS : DIST_RAY_UNRESOLVED);
-        if (foot->status == DIST_RAY_MISS) foot->distance = least;
-        else bench.index[active++] = (int)i;
-    }
-    while (active > 0) {
-        size_t kept = 0;
-        for (size_t i = 0; i < active; i++)
-            memcpy(bench.points + 3 * i, feet[bench.index[i]].x, 3 * sizeof(float));
-        field->eval_fn(field->user, worker, active, bench.points, bench.sdf, gradient);
-        for (size_t i = 0; i < active; i++)
-            if (disti_foot_advance(field, &feet[bench.index[i]], bench.sdf[i], gradient + 3 * i))
-                bench.index[kept++] = bench.index[i];
-        active = kept;
-    }
+    for (size_t i = 0; i < n; i++)
+        if (disti_foot_begin(job, first + i, &feet[i])) bench.index[active++] = (int)i;
+    disti_scene_whole(field, worker, 1);
+    disti_foot_rounds(field, worker, &bench, feet, gradient, active);
+    disti_foot_others(job, worker, &bench, first, n, feet, others, gradient);
+    disti_scene_whole(field, worker, 0);
     for (size_t i = 0; i < n; i++) {
         disti_foot *foot = &feet[i];
         float d[3] = {foot->p[0] - foot->x[0], foot->p[1] - foot->x[1], foot->p[2] - foot->x[2]};

@@ -119,6 +119,50 @@ TEST(rays_do_not_go_through_thin_shells_by_what_a_cache_skipped)
     dist_context_destroy(ctx);
 }
 
+/* A ball whose f rises faster than its figure says: a step on the way out ends outside of it. */
+static void hasty_eval(void *user, int worker, size_t n, const float *p, float *sdf, float *gradient)
+{
+    (void)user, (void)worker;
+    for (size_t i = 0; i < n; i++, p += 3) {
+        float length = (float)shape_length((double)p[0], (double)p[1], (double)p[2]);
+        sdf[i] = 1.3f * (length - 0.5f);
+        for (size_t k = 0; gradient && k < 3; k++) gradient[3 * i + k] = length > 0 ? 1.3f * p[k] / length : 0;
+    }
+}
+
+TEST(a_cache_hides_no_way_out)
+{
+    dist_context *ctx = shape_context();
+    dist_render_desc how;
+    dist_field field;
+    int lost = 0;
+    memset(&how, 0, sizeof how);
+    memset(&field, 0, sizeof field);
+    how.inside = DIST_INSIDE_EXIT;
+    field.eval_fn = hasty_eval;
+    field.radius = 1;
+    dist_cache *cache = dist_cache_create(ctx, &field, 64);
+    dist_field with = dist_cache_field(cache);
+    test_random random = test_random_seed(41);
+    for (int i = 0; i < RAYS; i++) {
+        test_random_direction(&random, origins + 3 * i);
+        test_random_direction(&random, directions + 3 * i);
+        float share = test_random_float(&random, 0, 0.49f);
+        for (int k = 0; k < 3; k++) origins[3 * i + k] *= share;
+    }
+    CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, RAYS, origins, directions, &how, plain, NULL), ctx);
+    CHECK_STATUS(DIST_OK, dist_trace(ctx, &with, RAYS, origins, directions, &how, cached, NULL), ctx);
+    for (int i = 0; i < RAYS; i++) {
+        CHECK_EQUAL(DIST_RAY_HIT, plain[i].status);
+        lost += cached[i].status != DIST_RAY_HIT;
+        if (cached[i].status == DIST_RAY_HIT) CHECK_NEAR((double)plain[i].distance, (double)cached[i].distance, 1e-4);
+    }
+    CHECK_EQUAL(0, lost);
+    if (test_state.verbose) printf("    %d of %d ways out are lost with the cache\n", lost, RAYS);
+    dist_cache_destroy(cache);
+    dist_context_destroy(ctx);
+}
+
 /* Networks, whose Lipschitz figures are sampled; with what is to be found again by a certified ray. */
 TEST(rays_of_networks_find_what_they_find_without_a_cache)
 {
@@ -535,6 +579,7 @@ int main(int argc, char **argv)
     RUN(what_a_cache_shows_empty_is);
     RUN(rays_find_what_they_find_without_a_cache_for_fewer_queries);
     RUN(rays_do_not_go_through_thin_shells_by_what_a_cache_skipped);
+    RUN(a_cache_hides_no_way_out);
     RUN(rays_of_networks_find_what_they_find_without_a_cache);
     RUN(spheres_that_are_clear_of_the_surface_ask_nothing);
     RUN(pictures_are_the_same_with_and_without_a_cache);

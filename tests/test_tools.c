@@ -231,6 +231,82 @@ TEST(what_is_far_away_finds_its_nearest_point_and_what_it_touches)
     dist_context_destroy(ctx);
 }
 
+/* A scene's own f ends in a valley around each instance's sphere, which must not hold a point on its way: a torus in
+   each of two orientations, a box, and a ball in a sphere twice its size, alone or as a scene in the scene. */
+TEST(points_find_the_nearest_instance_of_a_scene)
+{
+    enum { PARTS = 4 };
+    dist_context *ctx = shape_context();
+    const float box[6] = {0, 0, 0, 0.5f, 0.3f, 0.1f}, torus[5] = {0, 0, 0, 0.5f, 0.2f}, ball[4] = {0, 0, 0, 0.5f};
+    const double half[3] = {(double)box[3], (double)box[4], (double)box[5]};
+    dist_field fields[PARTS] = {dist_field_torus(torus), dist_field_torus(torus), dist_field_box(box),
+                                dist_field_sphere(ball)};
+    const float upright[9] = {1, 0, 0, 0, 0, 1, 0, -1, 0};
+    dist_instance parts[PARTS], whole;
+    fields[3].radius = 1;
+    memset(parts, 0, sizeof parts);
+    memset(&whole, 0, sizeof whole);
+    for (int k = 0; k < PARTS; k++) {
+        parts[k].field = &fields[k];
+        parts[k].placement.scale = k == 2 ? 2.0f : 1.0f;
+        for (int i = 0; i < 3; i++) parts[k].placement.translation[i] = k == i + 1 ? 2.5f : 0.0f;
+    }
+    memcpy(parts[1].placement.rotation, upright, sizeof upright);
+    for (int run = 0; run < 3 * (PARTS + 1) * 2; run++) {
+        int nested = run % 2, first = run / 2 % (PARTS + 1), count = 1, wrong = 0, lost = 0, told = 0;
+        if (first == PARTS) first = 0, count = PARTS;
+        dist_scene *inner = dist_scene_create(ctx, count, parts + first), *outer = NULL;
+        dist_field field = dist_scene_field(inner), placed = field;
+        if (nested) {
+            whole.field = &field;
+            outer = dist_scene_create(ctx, 1, &whole);
+            placed = dist_scene_field(outer);
+        }
+        static const double least[3] = {0, 1.05, 4}, most[3] = {1, 4, 30};
+        int band = run / (2 * (PARTS + 1));
+        test_random random = test_random_seed(91 + (unsigned)run);
+        for (int i = 0; i < RAYS; i++) {
+            float share = test_random_float(&random, (float)least[band], (float)most[band]) * placed.radius;
+            test_random_direction(&random, points + 3 * i);
+            for (int k = 0; k < 3; k++) points[3 * i + k] = placed.center[k] + share * points[3 * i + k];
+        }
+        CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &placed, RAYS, points, closest, distance, status), ctx);
+        for (int i = RAYS; i-- > 0;) {
+            double p[3], f = 1e30;
+            point_of(points + 3 * i, p);
+            for (int k = first; k < first + count; k++) {
+                double q[3];
+                for (int j = 0; j < 3; j++) q[j] = p[j] - (double)parts[k].placement.translation[j];
+                if (k == 1) {
+                    double y = q[1];
+                    q[1] = -q[2];
+                    q[2] = y;
+                }
+                for (int j = 0; j < 3 && k == 2; j++) q[j] /= 2;
+                f = fmin(f, k < 2    ? torus_distance((double)torus[3], (double)torus[4], q)
+                            : k == 2 ? 2 * box_distance(half, q)
+                                     : shape_length(q[0], q[1], q[2]) - (double)ball[3]);
+            }
+            lost += status[i] != DIST_RAY_HIT;
+            wrong += status[i] == DIST_RAY_HIT && fabs(f - (double)distance[i]) > 2e-3 * (double)placed.radius;
+            for (int k = 0; k < 3; k++) points[4 * i + k] = (float)p[k];
+            points[4 * i + 3] = (float)(fmax(f, 0) + 0.02 * (double)placed.radius);
+        }
+        CHECK_STATUS(DIST_OK, dist_field_collide(ctx, &placed, RAYS, points, contacts), ctx);
+        for (int i = 0; i < RAYS; i++) told += contacts[i].status != DIST_RAY_HIT;
+        CHECK_EQUAL(0, lost);
+        CHECK(wrong * 250 <= RAYS);
+        CHECK(told * 250 <= RAYS);
+        if (test_state.verbose)
+            printf("    %d of %d from part %d, %g to %g radii away%s: %d not found, %d wrong, %d told clear of %d\n",
+                   count, PARTS, first, least[band], most[band], nested ? ", in a scene" : "", lost, wrong, told,
+                   RAYS);
+        dist_scene_destroy(outer);
+        dist_scene_destroy(inner);
+    }
+    dist_context_destroy(ctx);
+}
+
 /* Where a field stands far from the origin the rounding of points changes f: what is exact then, and the bounds. */
 TEST(fields_far_from_the_origin_are_found_to_within_what_floats_can_tell)
 {
@@ -914,6 +990,7 @@ int main(int argc, char **argv)
     RUN(any_hit_and_max_distance_are_refused_where_they_mean_nothing);
     RUN(closest_points_of_distances_are_exact);
     RUN(what_is_far_away_finds_its_nearest_point_and_what_it_touches);
+    RUN(points_find_the_nearest_instance_of_a_scene);
     RUN(fields_far_from_the_origin_are_found_to_within_what_floats_can_tell);
     RUN(closest_points_of_other_fields_are_on_the_surface_and_near);
     RUN(closest_points_of_networks_lie_on_their_surface);

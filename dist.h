@@ -5155,6 +5155,16 @@ static void disti_scene_whole(const dist_field *field, int worker, int whole)
     for (int k = 0; k < scene->count; k++) disti_scene_whole(&scene->placed[k].field, worker, whole);
 }
 
+/* How far p is from the nearest of a scene's spheres, outside which there is nothing; 0 of other fields. */
+static float disti_scene_clear(const dist_field *field, const float *p)
+{
+    if (field->eval_fn != disti_scene_eval) return 0.0f;
+    const dist_scene *scene = (const dist_scene *)field->user;
+    float clear = 3e38f;
+    for (int k = 0; k < scene->count; k++) clear = DISTI_MIN(clear, disti_ball_distance(&scene->ball[k], p));
+    return DISTI_MAX(clear, 0.0f);
+}
+
 /* Instances that are no scenes. */
 static int disti_scene_leaves(const dist_field *field)
 {
@@ -11692,8 +11702,9 @@ static int disti_foot_begin(const disti_foot_job *job, size_t i, disti_foot *foo
     foot->status = DIST_RAY_NOT_FINITE;
     if (!disti_finite_all(job->stride, p)) return 0;
     foot->away = disti_foot_move(job->field, foot->x, zero, 0.0f);
-    float clear[3] = {foot->away, 0.0f, 0.0f};
-    if (job->contacts && job->field->cache) clear[1] = disti_cache_clear(job->field->cache, foot->x);
+    float clear[3] = {foot->away, job->contacts ? disti_scene_clear(job->field, foot->x) : 0.0f, 0.0f};
+    if (job->contacts && job->field->cache)
+        clear[1] = DISTI_MAX(clear[1], disti_cache_clear(job->field->cache, foot->x));
     float least = disti_foot_length(clear);
     int clear_of = job->contacts && least > 0.0f && least >= foot->radius;
     foot->status = (unsigned char)(clear_of ? DIST_RAY_MISS : DIST_RAY_UNRESOLVED);

@@ -811,6 +811,12 @@ TEST(spheres_touch_the_instance_that_is_there)
     CHECK_NEAR(1, contacts[1].normal[2], 1e-5);
     CHECK_NEAR(1, contacts[1].point[2], 1e-5);
     CHECK_EQUAL(DIST_RAY_MISS, contacts[2].status);
+    unsigned long long queries = dist_scene_queries(scene);
+    float between[4] = {0.9f, 0.9f, 0, 0.1f}; /* clear of both bounding spheres */
+    CHECK_STATUS(DIST_OK, dist_field_collide(ctx, &field, 1, between, contacts), ctx);
+    CHECK_EQUAL(DIST_RAY_MISS, contacts[0].status);
+    CHECK(contacts[0].depth < -0.4f);
+    CHECK_EQUAL(queries, dist_scene_queries(scene));
     dist_scene_destroy(scene);
     dist_context_destroy(ctx);
 }

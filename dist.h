@@ -11739,10 +11739,15 @@ static void disti_foot_others(const disti_foot_job *job, int worker, const disti
     if (leaves < 2) return;
     const dist_scene *scene = (const dist_scene *)field->user;
     disti_scene_work w;
-    for (size_t i = 0; i < n; i++) memcpy(bench->points + 3 * i, feet[i].best, 3 * sizeof(float));
+    size_t hits = 0;
+    for (size_t i = 0; i < n; i++) {
+        if (feet[i].status != DIST_RAY_HIT || feet[i].sign < 0.0f) continue;
+        memcpy(bench->points + 3 * hits, feet[i].best, 3 * sizeof(float));
+        bench->index[hits++] = (int)i;
+    }
     disti_scene_layout(scene, disti_scene_scratch(scene, worker), &w);
-    disti_scene_settle(scene, worker, n, bench->points, &w, 1);
-    memcpy(owner, w.winner, n * sizeof(int));
+    disti_scene_settle(scene, worker, hits, bench->points, &w, 1);
+    for (size_t j = 0; j < hits; j++) owner[bench->index[j]] = w.winner[j];
     for (int leaf = 0; leaf < leaves; leaf++) {
         int k = disti_scene_only(scene, worker, leaf), whole = disti_scene_leaves(&scene->placed[k].field) == 1;
         size_t active = 0, found = 0;

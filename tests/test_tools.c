@@ -815,7 +815,7 @@ TEST(spheres_touch_the_instance_that_is_there)
     float between[4] = {0.9f, 0.9f, 0, 0.1f}; /* clear of both bounding spheres */
     CHECK_STATUS(DIST_OK, dist_field_collide(ctx, &field, 1, between, contacts), ctx);
     CHECK_EQUAL(DIST_RAY_MISS, contacts[0].status);
-    CHECK(contacts[0].depth < -0.4f);
+    CHECK(contacts[0].depth < -0.2f);
     CHECK_EQUAL(queries, dist_scene_queries(scene));
     dist_scene_destroy(scene);
     dist_context_destroy(ctx);

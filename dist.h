@@ -5165,27 +5165,45 @@ static float disti_scene_clear(const dist_field *field, const float *p)
     return DISTI_MAX(clear, 0.0f);
 }
 
-/* Instances that are no scenes. */
-static int disti_scene_leaves(const dist_field *field)
-{
-    if (field->eval_fn != disti_scene_eval) return 1;
-    const dist_scene *scene = (const dist_scene *)field->user;
-    int leaves = 0;
-    for (int k = 0; k < scene->count; k++) leaves += disti_scene_leaves(&scene->placed[k].field);
-    return leaves;
-}
-
-/* From now on the worker gets b of that leaf alone. Returns the scene's instance that is it, or that it is in. */
-static int disti_scene_only(const dist_scene *scene, int worker, int leaf)
+/* From now on the worker gets b of that instance of the scene alone. */
+static void disti_scene_only(const dist_scene *scene, int worker, int instance)
 {
     disti_scene_work w;
-    int k = 0;
-    for (int more; leaf >= (more = disti_scene_leaves(&scene->placed[k].field)); k++) leaf -= more;
     disti_scene_layout(scene, disti_scene_scratch(scene, worker), &w);
-    *w.whole = 2 + k;
-    const dist_field *field = &scene->placed[k].field;
-    if (field->eval_fn == disti_scene_eval) disti_scene_only((const dist_scene *)field->user, worker, leaf);
-    return k;
+    *w.whole = 2 + instance;
+}
+
+/* A scene of more than one instance, here or in it. */
+static int disti_scene_several(const dist_field *field)
+{
+    if (field->eval_fn != disti_scene_eval) return 0;
+    const dist_scene *scene = (const dist_scene *)field->user;
+    return scene->count > 1 || disti_scene_several(&scene->placed[0].field);
+}
+
+/* Where an instance of an instance stands: x_world = scale rotation x + translation. */
+typedef struct disti_chain {
+    double scale, rotation[9], translation[3];
+} disti_chain;
+
+static void disti_chain_point(const disti_chain *chain, const float *p, double x[3])
+{
+    const double q[3] = {(double)p[0], (double)p[1], (double)p[2]};
+    disti_rotate(chain->rotation, q, x);
+    for (int i = 0; i < 3; i++) x[i] = chain->scale * x[i] + chain->translation[i];
+}
+
+static disti_chain disti_chain_on(const disti_chain *chain, const disti_placed *placed)
+{
+    disti_chain next;
+    next.scale = chain->scale * (double)placed->scale;
+    disti_chain_point(chain, placed->translation, next.translation);
+    for (int i = 0; i < 9; i++) {
+        next.rotation[i] = 0.0;
+        for (int k = 0; k < 3; k++)
+            next.rotation[i] += chain->rotation[i / 3 * 3 + k] * (double)placed->rotation[3 * k + i % 3];
+    }
+    return next;
 }
 
 /* What a color's gradient needs. */
@@ -11730,53 +11748,117 @@ static void disti_foot_rounds(const dist_field *field, int worker, const disti_b
 
 /* What points outside a scene of several found is the nearest of one instance, which f was least of; the others may
    have nearer ones. So each goes to every other alone whose sphere is nearer than what it found, and takes what is
-   nearer there and not within a third. `others`: as many feet again. */
-static void disti_foot_others(const disti_foot_job *job, int worker, const disti_bench *bench, size_t first, size_t n,
-                              disti_foot *feet, disti_foot *others, float *gradient)
+   nearer there and not within a third. */
+typedef struct disti_foot_tour {
+    const disti_foot_job *job;
+    const disti_bench *bench;
+    size_t first, n;
+    disti_foot *feet, *others; /* those of the one instance */
+    float *gradient;
+    int worker, owner[DISTI_FEET]; /* the scene's instance that a foot stands on */
+} disti_foot_tour;
+
+/* Of a foot, how near something must be to be wanted; 0: no more is. */
+static float disti_foot_wants(const disti_foot *foot)
 {
-    const dist_field *field = job->field;
-    int leaves = disti_scene_leaves(field), owner[DISTI_FEET];
-    if (leaves < 2) return;
+    if (foot->sign < 0.0f) return 0.0f;
+    return foot->status == DIST_RAY_HIT ? foot->distance : foot->status == DIST_RAY_UNRESOLVED ? foot->radius : 0.0f;
+}
+
+/* Lists whom a sphere of the world may have something nearer for. top: it is that instance of the scene's, else -1. */
+static size_t disti_foot_list(const disti_foot_tour *tour, const double center[3], double radius, int top)
+{
+    size_t count = 0;
+    for (size_t i = 0; i < tour->n; i++) {
+        const disti_foot *foot = &tour->feet[i];
+        double d[3], within = (double)disti_foot_wants(foot);
+        for (int k = 0; k < 3; k++) d[k] = (double)foot->p[k] - center[k];
+        if (!(within > 0.0) || !(sqrt(disti_dot(d, d)) - radius < within)) continue;
+        if (top >= 0 && foot->status == DIST_RAY_HIT && tour->owner[i] == top) continue;
+        tour->bench->index[count++] = (int)i;
+    }
+    return count;
+}
+
+/* The listed ones go to the instance that the scenes are set to. */
+static void disti_foot_visit(disti_foot_tour *tour, size_t count, int top)
+{
+    const dist_field *field = tour->job->field;
+    const disti_bench *bench = tour->bench;
+    size_t active = 0, found = 0;
+    for (size_t i = 0; i < tour->n; i++) tour->others[i].status = DIST_RAY_SKIPPED;
+    for (size_t j = 0; j < count; j++) {
+        size_t i = (size_t)bench->index[j];
+        if (disti_foot_begin(tour->job, tour->first + i, &tour->others[i])) bench->index[active++] = (int)i;
+        tour->others[i].radius = disti_foot_wants(&tour->feet[i]);
+    }
+    disti_foot_rounds(field, tour->worker, bench, tour->others, tour->gradient, active);
+    disti_scene_whole(field, tour->worker, 1);
+    for (size_t i = 0; i < tour->n; i++) {
+        const disti_foot *other = &tour->others[i];
+        if (other->status != DIST_RAY_HIT || !(other->distance < other->radius)) continue;
+        memcpy(bench->points + 3 * found, other->best, 3 * sizeof(float));
+        bench->index[found++] = (int)i;
+    }
+    if (found > 0) field->eval_fn(field->user, tour->worker, found, bench->points, bench->sdf, NULL);
+    for (size_t j = 0; j < found; j++) {
+        size_t i = (size_t)bench->index[j];
+        if (!(bench->sdf[j] > -1e-4f * field->radius)) continue;
+        tour->others[i].radius = tour->feet[i].radius;
+        tour->feet[i] = tour->others[i];
+        tour->owner[i] = top;
+    }
+}
+
+/* The way to an instance of an instance: of each scene on it, from the last, which instance. */
+typedef struct disti_foot_way {
+    const struct disti_foot_way *from;
+    const dist_scene *scene;
+    int instance;
+} disti_foot_way;
+
+/* To each instance of the scene, and of those in it; top: the outermost scene's instance that this one is in. */
+static void disti_foot_call(disti_foot_tour *tour, const dist_scene *scene, const disti_chain *chain,
+                            const disti_foot_way *from, int top)
+{
+    for (int k = 0; k < scene->count; k++) {
+        const dist_field *field = &scene->placed[k].field;
+        int inner = field->eval_fn == disti_scene_eval;
+        const disti_foot_way way = {from, scene, k};
+        double center[3];
+        disti_chain_point(chain, scene->ball[k].center, center);
+        double radius = chain->scale * (double)scene->ball[k].radius;
+        size_t count = disti_foot_list(tour, center, radius, inner || from ? -1 : k);
+        if (count == 0) continue;
+        if (inner) {
+            disti_chain next = disti_chain_on(chain, &scene->placed[k]);
+            disti_foot_call(tour, (const dist_scene *)field->user, &next, &way, from ? top : k);
+            continue;
+        }
+        for (const disti_foot_way *w = &way; w; w = w->from) disti_scene_only(w->scene, tour->worker, w->instance);
+        disti_foot_visit(tour, count, from ? top : k);
+    }
+}
+
+static void disti_foot_others(disti_foot_tour *tour)
+{
+    const dist_field *field = tour->job->field;
+    const disti_chain here = {1.0, {1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0}, {0.0, 0.0, 0.0}};
+    if (!disti_scene_several(field)) return;
     const dist_scene *scene = (const dist_scene *)field->user;
+    const disti_bench *bench = tour->bench;
     disti_scene_work w;
     size_t hits = 0;
-    for (size_t i = 0; i < n; i++) {
-        if (feet[i].status != DIST_RAY_HIT || feet[i].sign < 0.0f) continue;
-        memcpy(bench->points + 3 * hits, feet[i].best, 3 * sizeof(float));
+    for (size_t i = 0; i < tour->n; i++) {
+        const disti_foot *foot = &tour->feet[i];
+        if (foot->status != DIST_RAY_HIT || foot->sign < 0.0f) continue;
+        memcpy(bench->points + 3 * hits, foot->best, 3 * sizeof(float));
         bench->index[hits++] = (int)i;
     }
-    disti_scene_layout(scene, disti_scene_scratch(scene, worker), &w);
-    disti_scene_settle(scene, worker, hits, bench->points, &w, 1);
-    for (size_t j = 0; j < hits; j++) owner[bench->index[j]] = w.winner[j];
-    for (int leaf = 0; leaf < leaves; leaf++) {
-        int k = disti_scene_only(scene, worker, leaf), whole = disti_scene_leaves(&scene->placed[k].field) == 1;
-        size_t active = 0, found = 0;
-        for (size_t i = 0; i < n; i++) {
-            int hit = feet[i].status == DIST_RAY_HIT;
-            float within = hit ? feet[i].distance : feet[i].radius;
-            others[i].status = DIST_RAY_SKIPPED;
-            if ((!hit && feet[i].status != DIST_RAY_UNRESOLVED) || feet[i].sign < 0.0f) continue;
-            if (hit && whole && owner[i] == k) continue;
-            if (!(disti_ball_distance(&scene->ball[k], feet[i].p) < within)) continue;
-            if (disti_foot_begin(job, first + i, &others[i])) bench->index[active++] = (int)i;
-            others[i].radius = within;
-        }
-        disti_foot_rounds(field, worker, bench, others, gradient, active);
-        disti_scene_whole(field, worker, 1);
-        for (size_t i = 0; i < n; i++) {
-            if (others[i].status != DIST_RAY_HIT || !(others[i].distance < others[i].radius)) continue;
-            memcpy(bench->points + 3 * found, others[i].best, 3 * sizeof(float));
-            bench->index[found++] = (int)i;
-        }
-        if (found > 0) field->eval_fn(field->user, worker, found, bench->points, bench->sdf, NULL);
-        for (size_t j = 0; j < found; j++) {
-            size_t i = (size_t)bench->index[j];
-            if (!(bench->sdf[j] > -1e-4f * field->radius)) continue;
-            others[i].radius = feet[i].radius;
-            feet[i] = others[i];
-            owner[i] = k;
-        }
-    }
+    disti_scene_layout(scene, disti_scene_scratch(scene, tour->worker), &w);
+    disti_scene_settle(scene, tour->worker, hits, bench->points, &w, 1);
+    for (size_t j = 0; j < hits; j++) tour->owner[bench->index[j]] = w.winner[j];
+    disti_foot_call(tour, scene, &here, NULL, -1);
 }
 
 static void disti_foot_task(void *arg, int index, int worker)
@@ -11790,11 +11872,20 @@ static void disti_foot_task(void *arg, int index, int worker)
     disti_foot *feet = (disti_foot *)(void *)bench.rest, *others = feet + DISTI_FEET;
     float *gradient = (float *)(void *)(others + DISTI_FEET);
     size_t first = (size_t)index * DISTI_FEET, n = DISTI_MIN((size_t)DISTI_FEET, job->n - first), active = 0;
+    disti_foot_tour tour;
+    tour.job = job;
+    tour.bench = &bench;
+    tour.first = first;
+    tour.n = n;
+    tour.feet = feet;
+    tour.others = others;
+    tour.gradient = gradient;
+    tour.worker = worker;
     for (size_t i = 0; i < n; i++)
         if (disti_foot_begin(job, first + i, &feet[i])) bench.index[active++] = (int)i;
     disti_scene_whole(field, worker, 1);
     disti_foot_rounds(field, worker, &bench, feet, gradient, active);
-    disti_foot_others(job, worker, &bench, first, n, feet, others, gradient);
+    disti_foot_others(&tour);
     disti_scene_whole(field, worker, 0);
     for (size_t i = 0; i < n; i++) {
         disti_foot *foot = &feet[i];

@@ -241,7 +241,7 @@ TEST(points_find_the_nearest_instance_of_a_scene)
     const double half[3] = {(double)box[3], (double)box[4], (double)box[5]};
     dist_field fields[PARTS] = {dist_field_torus(torus), dist_field_torus(torus), dist_field_box(box),
                                 dist_field_sphere(ball)};
-    const float upright[9] = {1, 0, 0, 0, 0, 1, 0, -1, 0};
+    const float upright[9] = {1, 0, 0, 0, 0, 1, 0, -1, 0}, away[3] = {1, -2, 3};
     dist_instance parts[PARTS], whole;
     fields[3].radius = 1;
     memset(parts, 0, sizeof parts);
@@ -252,6 +252,9 @@ TEST(points_find_the_nearest_instance_of_a_scene)
         for (int i = 0; i < 3; i++) parts[k].placement.translation[i] = k == i + 1 ? 2.5f : 0.0f;
     }
     memcpy(parts[1].placement.rotation, upright, sizeof upright);
+    memcpy(whole.placement.rotation, upright, sizeof upright);
+    memcpy(whole.placement.translation, away, sizeof away);
+    whole.placement.scale = 2;
     for (int run = 0; run < 3 * (PARTS + 1) * 2; run++) {
         int nested = run % 2, first = run / 2 % (PARTS + 1), count = 1, wrong = 0, lost = 0, told = 0;
         if (first == PARTS) first = 0, count = PARTS;
@@ -274,6 +277,12 @@ TEST(points_find_the_nearest_instance_of_a_scene)
         for (int i = RAYS; i-- > 0;) {
             double p[3], f = 1e30;
             point_of(points + 3 * i, p);
+            if (nested) {
+                for (int k = 0; k < 3; k++) p[k] = (p[k] - (double)away[k]) / 2;
+                double y = p[1];
+                p[1] = -p[2];
+                p[2] = y;
+            }
             for (int k = first; k < first + count; k++) {
                 double q[3];
                 for (int j = 0; j < 3; j++) q[j] = p[j] - (double)parts[k].placement.translation[j];
@@ -287,9 +296,10 @@ TEST(points_find_the_nearest_instance_of_a_scene)
                             : k == 2 ? 2 * box_distance(half, q)
                                      : shape_length(q[0], q[1], q[2]) - (double)ball[3]);
             }
+            if (nested) f *= 2;
             lost += status[i] != DIST_RAY_HIT;
             wrong += status[i] == DIST_RAY_HIT && fabs(f - (double)distance[i]) > 2e-3 * (double)placed.radius;
-            for (int k = 0; k < 3; k++) points[4 * i + k] = (float)p[k];
+            for (int k = 3; k-- > 0;) points[4 * i + k] = points[3 * i + k];
             points[4 * i + 3] = (float)(fmax(f, 0) + 0.02 * (double)placed.radius);
         }
         CHECK_STATUS(DIST_OK, dist_field_collide(ctx, &placed, RAYS, points, contacts), ctx);

@@ -352,7 +352,8 @@ DIST_API dist_field dist_scene_field(dist_scene *scene);
 /* Where instance `index` begins in the scene's code; its placement are the seven numbers before instance index + 1.
    index = count: all of them. -1 out of range. */
 DIST_API int dist_scene_offset(const dist_scene *scene, int index);
-/* Which instance is nearest to each of n points, index (n): after dist_trace, what was hit. */
+/* Which instance f is least of at each of n points, index (n): after dist_trace, what was hit. Away from the surfaces
+   that is not always the nearest, as f is a bound there: dist_field_closest_point, and then this. */
 DIST_API dist_status dist_scene_find(dist_scene *scene, size_t n, const float *points, int *index);
 /* Points that the instances' fields were asked since the scene was made. */
 DIST_API unsigned long long dist_scene_queries(const dist_scene *scene);
@@ -614,8 +615,8 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
    as far off as the nearest to within 1e-4 of the radius, 1e-3 from a radius outside the bounding sphere on, where one
    point in thousands also ends on a part that is not the nearest; else mostly the nearest, at the least a local one:
    where a decoder's f is no distance far from the surface, many points well outside the bounding sphere end on another
-   part, and large spheres of dist_field_collide that just touch are told to be clear. Outside a scene each instance is
-   gone to by itself that may be nearer; what is of one within another is no surface.
+   part, and some spheres of dist_field_collide that touch are told to be clear. Of a scene each instance that may be
+   nearest is gone to by itself; what is of one within another is no surface.
    closest (n, 3); distance (n) signed, below 0 inside, and status (n) may be NULL: DIST_RAY_HIT, DIST_RAY_UNRESOLVED
    (no surface found: the last point tried), DIST_RAY_NOT_FINITE. Nothing is asked outside the bounding sphere. */
 DIST_API dist_status dist_field_closest_point(dist_context *ctx, const dist_field *field, size_t n,
@@ -4757,8 +4758,7 @@ static float disti_steepest(const dist_field *field)
      d <= 0      b = f(q)
      0 < d       b = sqrt(d^2 + v^2),  v = max(f(c + r n), 0),  n = (q - c) / |q - c|      (a ball is convex)
      phi         min(b, m + |d - m|): continuous, no steeper than f or 1, b itself wherever b < m, and d where d >= m,
-                 which needs no query. It falls outward from the sphere to where d = m: who follows its gradient ends
-                 there, and asks for all of b instead (disti_scene_whole: m without end)
+                 which needs no query
      scene       f(p) = min_i f_i(p): in order of d, instances are asked while s d is below the least value so far
 
    backward    grad f_i = R grad phi
@@ -4793,7 +4793,6 @@ enum { DISTI_SCENE_CHUNK = 2048, DISTI_SCENE_PIECE = DISTI_BLOCK, DISTI_CONTESTE
 /* A worker's share of a scene's memory, for a chunk of points. */
 typedef struct disti_scene_work {
     unsigned long long *queries;
-    int *whole;    /* 1: b is wanted everywhere, 2 + k: of instance k alone */
     int *start;    /* (count + 1): of each instance's group in order, point */
     int *order;    /* points by instance */
     float *local;  /* (n, 3): what is asked, by instance */
@@ -4811,7 +4810,6 @@ static size_t disti_scene_layout(const dist_scene *scene, unsigned char *base, d
 {
     size_t at = 0, n = DISTI_SCENE_CHUNK;
     w->queries = (unsigned long long *)disti_take(base, &at, 1, sizeof(unsigned long long));
-    w->whole = (int *)disti_take(base, &at, 1, sizeof(int));
     w->start = (int *)disti_take(base, &at, (size_t)scene->count + 1, sizeof(int));
     w->order = (int *)disti_take(base, &at, n, sizeof(int));
     w->local = (float *)disti_take(base, &at, n, 3 * sizeof(float));
@@ -4863,26 +4861,21 @@ static void disti_placed_unproject(const disti_placed *placed, const float *p, f
     for (int i = 0; i < 3; i++) y[i] = radius / away * (y[i] - along * n[i] / away);
 }
 
-static float disti_scene_margin(const disti_scene_work *w, const disti_ball *ball)
+/* f_i at p, d from the sphere in the world, where the field answered f. */
+static float disti_placed_value(const disti_placed *placed, const disti_ball *ball, float d, float f)
 {
-    return *w->whole ? 1e18f : ball->margin;
-}
-
-/* f_i at p, d from the sphere in the world, where the field answered f; m: the margin. */
-static float disti_placed_value(const disti_placed *placed, float m, float d, float f)
-{
-    float b = placed->scale * f;
+    float b = placed->scale * f, m = ball->margin;
     if (!disti_finite(b)) return b;
     if (d > 0.0f) b = sqrtf(d * d + DISTI_MAX(b, 0.0f) * DISTI_MAX(b, 0.0f));
     return DISTI_MIN(b, m + (d > m ? d - m : m - d));
 }
 
 /* The same with its gradient, from g = grad f, and weight = df_i/df. */
-static float disti_placed_gradient(const disti_placed *placed, const disti_ball *ball, float margin, const float *p,
-                                   float d, float f, const float *g, float *gradient, float *weight)
+static float disti_placed_gradient(const disti_placed *placed, const disti_ball *ball, const float *p, float d, float f,
+                                   const float *g, float *gradient, float *weight)
 {
     const float *m = placed->rotation;
-    float n[3], v = DISTI_MAX(placed->scale * f, 0.0f), value = disti_placed_value(placed, margin, d, f), along = 0.0f;
+    float n[3], v = DISTI_MAX(placed->scale * f, 0.0f), value = disti_placed_value(placed, ball, d, f), along = 0.0f;
     float length = DISTI_MAX(d + ball->radius, 1e-30f);
     *weight = placed->scale;
     for (int i = 0; i < 3; i++) {
@@ -4891,8 +4884,8 @@ static float disti_placed_gradient(const disti_placed *placed, const disti_ball 
         along += n[i] * gradient[i];
     }
     if (!disti_finite(value)) return value;
-    float b = d > 0.0f ? sqrtf(d * d + v * v) : placed->scale * f, beside = d - margin;
-    if (b > margin + fabsf(beside)) {
+    float b = d > 0.0f ? sqrtf(d * d + v * v) : placed->scale * f, beside = d - ball->margin;
+    if (b > ball->margin + fabsf(beside)) {
         *weight = 0.0f;
         for (int i = 0; i < 3; i++) gradient[i] = beside > 0.0f ? n[i] : -n[i];
     } else if (d > 0.0f) {
@@ -4911,8 +4904,7 @@ static void disti_scene_next(const dist_scene *scene, const float *p, disti_scen
     w->choice[i] = -1;
     for (int k = 0; k < scene->count; k++) {
         float d = disti_ball_distance(&scene->ball[k], p);
-        float m = disti_scene_margin(w, &scene->ball[k]);
-        if (!(d < least) || d >= m || d < after || (d <= after && k <= last)) continue;
+        if (!(d < least) || d >= scene->ball[k].margin || d < after || (d <= after && k <= last)) continue;
         w->choice[i] = k;
         w->lower[i] = least = d;
     }
@@ -4923,18 +4915,16 @@ static void disti_scene_next(const dist_scene *scene, const float *p, disti_scen
 static int disti_scene_begin(const dist_scene *scene, const float *p, disti_scene_work *w, size_t i, int hint)
 {
     float best = 3e38f, first = 3e38f, second = 3e38f, limit = 1e18f;
-    int alone = *w->whole >= 2, count = alone ? 0 : scene->count;
-    if (alone) hint = *w->whole - 2;
     w->choice[i] = -1;
     w->winner[i] = hint;
     w->asked[i] = 0;
-    for (int k = -1; k < count; k++) {
+    for (int k = -1; k < scene->count; k++) {
         int at = k < 0 ? hint : k;
         const disti_ball *ball = &scene->ball[at];
         float x = p[0] - ball->center[0], y = p[1] - ball->center[1], z = p[2] - ball->center[2];
         float square = x * x + y * y + z * z, reach = limit + ball->radius;
         if (square >= reach * reach || k == hint) continue;
-        float d = disti_float(disti_float(sqrtf(square)) - ball->radius), m = disti_scene_margin(w, ball);
+        float d = disti_float(disti_float(sqrtf(square)) - ball->radius), m = ball->margin;
         if (d >= m) {
             if (d >= best) continue;
             best = d;
@@ -4990,8 +4980,7 @@ static void disti_scene_rounds(const dist_scene *scene, int worker, size_t n, co
         for (size_t at = 0; at < total; at++) {
             size_t i = (size_t)w->order[at];
             int k = w->choice[i];
-            float m = disti_scene_margin(w, &scene->ball[k]);
-            float f = disti_placed_value(&scene->placed[k], m, w->lower[i], w->value[at]);
+            float f = disti_placed_value(&scene->placed[k], &scene->ball[k], w->lower[i], w->value[at]);
             if (!disti_finite(f) || f < w->best[i]) {
                 w->best[i] = f;
                 w->winner[i] = k;
@@ -5094,9 +5083,8 @@ static void disti_scene_seed(void *user, size_t first, size_t count, const float
         size_t i = (size_t)w->order[link->group + first + j];
         float g[3], weight;
         int k = w->choice[i];
-        const disti_ball *ball = &link->scene->ball[k];
-        float f = disti_placed_gradient(&link->scene->placed[k], ball, disti_scene_margin(w, ball),
-                                        link->points + 3 * i, w->lower[i], sdf[j], gradient + 3 * j, g, &weight);
+        float f = disti_placed_gradient(&link->scene->placed[k], &link->scene->ball[k], link->points + 3 * i,
+                                        w->lower[i], sdf[j], gradient + 3 * j, g, &weight);
         d_sdf[j] = 0.0f;
         if (disti_finite(f) && f >= w->best[i]) disti_scene_emit_ball(link, i);
         else d_sdf[j] = weight * disti_scene_emit(link, i, k, f, g);
@@ -5144,44 +5132,17 @@ static void disti_scene_eval(void *user, int worker, size_t n, const float *poin
     disti_scene_fused(user, worker, n, points, sdf, gradient, NULL, NULL, NULL);
 }
 
-/* From now on the worker gets b of a scene, and of those in it, everywhere, or (whole 0) what is traced again. */
-static void disti_scene_whole(const dist_field *field, int worker, int whole)
+/* Instances that are no scenes. */
+static int disti_scene_leaves(const dist_field *field)
 {
-    if (field->eval_fn != disti_scene_eval) return;
+    if (field->eval_fn != disti_scene_eval) return 1;
     const dist_scene *scene = (const dist_scene *)field->user;
-    disti_scene_work w;
-    disti_scene_layout(scene, disti_scene_scratch(scene, worker), &w);
-    *w.whole = whole;
-    for (int k = 0; k < scene->count; k++) disti_scene_whole(&scene->placed[k].field, worker, whole);
+    int leaves = 0;
+    for (int k = 0; k < scene->count; k++) leaves += disti_scene_leaves(&scene->placed[k].field);
+    return leaves;
 }
 
-/* How far p is from the nearest of a scene's spheres, outside which there is nothing; 0 of other fields. */
-static float disti_scene_clear(const dist_field *field, const float *p)
-{
-    if (field->eval_fn != disti_scene_eval) return 0.0f;
-    const dist_scene *scene = (const dist_scene *)field->user;
-    float clear = 3e38f;
-    for (int k = 0; k < scene->count; k++) clear = DISTI_MIN(clear, disti_ball_distance(&scene->ball[k], p));
-    return DISTI_MAX(clear, 0.0f);
-}
-
-/* From now on the worker gets b of that instance of the scene alone. */
-static void disti_scene_only(const dist_scene *scene, int worker, int instance)
-{
-    disti_scene_work w;
-    disti_scene_layout(scene, disti_scene_scratch(scene, worker), &w);
-    *w.whole = 2 + instance;
-}
-
-/* A scene of more than one instance, here or in it. */
-static int disti_scene_several(const dist_field *field)
-{
-    if (field->eval_fn != disti_scene_eval) return 0;
-    const dist_scene *scene = (const dist_scene *)field->user;
-    return scene->count > 1 || disti_scene_several(&scene->placed[0].field);
-}
-
-/* Where an instance of an instance stands: x_world = scale rotation x + translation. */
+/* Where an instance, or one of an instance, stands: x_world = scale rotation x + translation. */
 typedef struct disti_chain {
     double scale, rotation[9], translation[3];
 } disti_chain;
@@ -5191,6 +5152,14 @@ static void disti_chain_point(const disti_chain *chain, const float *p, double x
     const double q[3] = {(double)p[0], (double)p[1], (double)p[2]};
     disti_rotate(chain->rotation, q, x);
     for (int i = 0; i < 3; i++) x[i] = chain->scale * x[i] + chain->translation[i];
+}
+
+static void disti_chain_back(const disti_chain *chain, const float *x, float q[3])
+{
+    double d[3], p[3];
+    for (int i = 0; i < 3; i++) d[i] = (double)x[i] - chain->translation[i];
+    disti_rotate_back(chain->rotation, d, p);
+    for (int i = 0; i < 3; i++) q[i] = (float)(p[i] / chain->scale);
 }
 
 static disti_chain disti_chain_on(const disti_chain *chain, const disti_placed *placed)
@@ -11706,36 +11675,37 @@ typedef struct disti_foot_job {
     dist_contact *contacts;
 } disti_foot_job;
 
-/* Point i sets out. 0: it is done already. */
-static int disti_foot_begin(const disti_foot_job *job, size_t i, disti_foot *foot)
+/* Sets out from p in the field's space; what is no nearer than radius is not wanted. 0: it is done already. */
+static int disti_foot_begin(const dist_field *field, const float *p, float radius, disti_foot *foot)
 {
-    const float *p = job->points + job->stride * i, zero[3] = {0.0f, 0.0f, 0.0f};
+    const float zero[3] = {0.0f, 0.0f, 0.0f};
     memset(foot, 0, sizeof *foot);
     memcpy(foot->p, p, sizeof foot->p);
     memcpy(foot->x, p, sizeof foot->x);
     foot->distance = 3e38f;
-    foot->radius = job->contacts ? p[3] : 3e38f;
+    foot->radius = radius;
     foot->damping = foot->relax = foot->sign = 1.0f;
     foot->share = 0.5f;
     foot->status = DIST_RAY_NOT_FINITE;
-    if (!disti_finite_all(job->stride, p)) return 0;
-    foot->away = disti_foot_move(job->field, foot->x, zero, 0.0f);
-    float clear[3] = {foot->away, job->contacts ? disti_scene_clear(job->field, foot->x) : 0.0f, 0.0f};
-    if (job->contacts && job->field->cache)
-        clear[1] = DISTI_MAX(clear[1], disti_cache_clear(job->field->cache, foot->x));
+    if (!disti_finite_all(3, p) || !disti_finite(radius)) return 0;
+    foot->away = disti_foot_move(field, foot->x, zero, 0.0f);
+    int limited = radius < 3e38f;
+    float clear[3] = {foot->away, field->cache && limited ? disti_cache_clear(field->cache, foot->x) : 0.0f, 0.0f};
     float least = disti_foot_length(clear);
-    int clear_of = job->contacts && least > 0.0f && least >= foot->radius;
+    int clear_of = limited && least > 0.0f && least >= radius;
     foot->status = (unsigned char)(clear_of ? DIST_RAY_MISS : DIST_RAY_UNRESOLVED);
     if (clear_of) foot->distance = least;
     return !clear_of;
 }
 
-/* Goes on until the `active` ones that bench->index lists have arrived. */
-static void disti_foot_rounds(const dist_field *field, int worker, const disti_bench *bench, disti_foot *feet,
-                              float *gradient, size_t active)
+/* Goes on until the `active` ones that bench->index lists have arrived. Returns how often f was asked. */
+static size_t disti_foot_rounds(const dist_field *field, int worker, const disti_bench *bench, disti_foot *feet,
+                                float *gradient, size_t active)
 {
+    size_t asked = 0;
     while (active > 0) {
         size_t kept = 0;
+        asked += active;
         for (size_t i = 0; i < active; i++)
             memcpy(bench->points + 3 * i, feet[bench->index[i]].x, 3 * sizeof(float));
         field->eval_fn(field->user, worker, active, bench->points, bench->sdf, gradient);
@@ -11744,121 +11714,188 @@ static void disti_foot_rounds(const dist_field *field, int worker, const disti_b
                 bench->index[kept++] = bench->index[i];
         active = kept;
     }
+    return asked;
 }
 
-/* What points outside a scene of several found is the nearest of one instance, which f was least of; the others may
-   have nearer ones. So each goes to every other alone whose sphere is nearer than what it found, and takes what is
-   nearer there and not within a third. */
+/* Scenes. f is a bound of the distance between an instance's sphere and a fifth of its radius off the surface, falls
+   outward there, and does not tell which of two instances is nearer. So points go to each instance in its own space,
+   first to the one whose sphere is nearest (the passes), then to those whose spheres are nearer than what was found.
+   What is found within another instance is no surface of the scene; there, where instances overlap, f itself leads. */
+enum { DISTI_TOUR_CHOOSE, DISTI_TOUR_FIRST, DISTI_TOUR_REST };
+enum { DISTI_DOUBT_WITHIN = 1, DISTI_DOUBT_FINITE = 2, DISTI_DOUBT_FOUND = 4 };
+
 typedef struct disti_foot_tour {
-    const disti_foot_job *job;
+    const dist_field *field;
     const disti_bench *bench;
-    size_t first, n;
-    disti_foot *feet, *others; /* those of the one instance */
+    size_t n;
+    disti_foot *feet, *others; /* of the scene, and those in an instance's space */
     float *gradient;
-    int worker, owner[DISTI_FEET]; /* the scene's instance that a foot stands on */
+    int worker, pass;
+    int leaves, leaf;          /* instances that are no scenes, and which of them comes next */
+    int first[DISTI_FEET];     /* leaf whose sphere is nearest */
+    float clear[DISTI_FEET];   /* to choose: how near that is; then how near what was not gone to may be */
+    unsigned char doubt[DISTI_FEET];
 } disti_foot_tour;
 
 /* Of a foot, how near something must be to be wanted; 0: no more is. */
-static float disti_foot_wants(const disti_foot *foot)
+static float disti_foot_wants(const disti_foot *foot, int doubt)
 {
-    if (foot->sign < 0.0f) return 0.0f;
-    return foot->status == DIST_RAY_HIT ? foot->distance : foot->status == DIST_RAY_UNRESOLVED ? foot->radius : 0.0f;
+    if (foot->status == DIST_RAY_UNRESOLVED) return foot->radius;
+    if (foot->status != DIST_RAY_HIT || (foot->sign < 0.0f && !(doubt & DISTI_DOUBT_WITHIN))) return 0.0f;
+    return DISTI_MIN(foot->distance, foot->radius);
 }
 
-/* Lists whom a sphere of the world may have something nearer for. top: it is that instance of the scene's, else -1. */
-static size_t disti_foot_list(const disti_foot_tour *tour, const double center[3], double radius, int top)
+/* Lists the feet that go into a sphere that holds the next so many leaves. */
+static size_t disti_foot_list(disti_foot_tour *tour, const double center[3], double radius, int leaves, int inner)
 {
     size_t count = 0;
     for (size_t i = 0; i < tour->n; i++) {
         const disti_foot *foot = &tour->feet[i];
-        double d[3], within = (double)disti_foot_wants(foot);
+        float within = disti_foot_wants(foot, tour->doubt[i]);
+        double d[3];
+        if (!(within > 0.0f)) continue;
         for (int k = 0; k < 3; k++) d[k] = (double)foot->p[k] - center[k];
-        if (!(within > 0.0) || !(sqrt(disti_dot(d, d)) - radius < within)) continue;
-        if (top >= 0 && foot->status == DIST_RAY_HIT && tour->owner[i] == top) continue;
+        float away = (float)DISTI_MIN(sqrt(disti_dot(d, d)) - radius, 3e38);
+        int first = tour->first[i] >= tour->leaf && tour->first[i] < tour->leaf + leaves;
+        if (tour->pass == DISTI_TOUR_CHOOSE ? !(away < tour->clear[i])
+                                            : tour->pass == DISTI_TOUR_FIRST ? !first : first && !inner) continue;
+        if (tour->pass == DISTI_TOUR_CHOOSE && !inner) {
+            tour->first[i] = tour->leaf;
+            tour->clear[i] = away;
+        } else if (tour->pass != DISTI_TOUR_CHOOSE && !(away < within)) {
+            tour->clear[i] = DISTI_MIN(tour->clear[i], away);
+            continue;
+        }
         tour->bench->index[count++] = (int)i;
     }
     return count;
 }
 
-/* The listed ones go to the instance that the scenes are set to. */
-static void disti_foot_visit(disti_foot_tour *tour, size_t count, int top)
+/* The listed ones go to an instance. Returns how often it was asked. */
+static size_t disti_foot_visit(disti_foot_tour *tour, const dist_field *field, const disti_chain *chain, size_t count)
 {
-    const dist_field *field = tour->job->field;
     const disti_bench *bench = tour->bench;
+    const float within = -1e-4f * (float)chain->scale * field->radius - 2e-6f * tour->field->radius;
     size_t active = 0, found = 0;
     for (size_t i = 0; i < tour->n; i++) tour->others[i].status = DIST_RAY_SKIPPED;
     for (size_t j = 0; j < count; j++) {
         size_t i = (size_t)bench->index[j];
-        if (disti_foot_begin(tour->job, tour->first + i, &tour->others[i])) bench->index[active++] = (int)i;
-        tour->others[i].radius = disti_foot_wants(&tour->feet[i]);
+        float q[3], wants = disti_foot_wants(&tour->feet[i], tour->doubt[i]);
+        disti_chain_back(chain, tour->feet[i].p, q);
+        wants = (float)DISTI_MIN((double)wants / chain->scale, 3e38);
+        if (disti_foot_begin(field, q, wants, &tour->others[i])) bench->index[active++] = (int)i;
     }
-    disti_foot_rounds(field, tour->worker, bench, tour->others, tour->gradient, active);
-    disti_scene_whole(field, tour->worker, 1);
+    size_t asked = disti_foot_rounds(field, tour->worker, bench, tour->others, tour->gradient, active);
     for (size_t i = 0; i < tour->n; i++) {
-        const disti_foot *other = &tour->others[i];
-        if (other->status != DIST_RAY_HIT || !(other->distance < other->radius)) continue;
-        memcpy(bench->points + 3 * found, other->best, 3 * sizeof(float));
-        bench->index[found++] = (int)i;
+        disti_foot *foot = &tour->feet[i], *other = &tour->others[i];
+        if (other->status == DIST_RAY_SKIPPED) continue;
+        if (other->status == DIST_RAY_NOT_FINITE) tour->doubt[i] |= DISTI_DOUBT_FINITE;
+        if (other->status == DIST_RAY_UNRESOLVED) tour->doubt[i] |= DISTI_DOUBT_FOUND;
+        if (other->status == DIST_RAY_MISS)
+            tour->clear[i] = DISTI_MIN(tour->clear[i], (float)((double)other->distance * chain->scale));
+        if (other->sign < 0.0f) foot->sign = -1.0f;
+        if (other->status != DIST_RAY_HIT) continue;
+        double x[3];
+        float d[3];
+        disti_chain_point(chain, other->best, x);
+        for (int k = 0; k < 3; k++) {
+            bench->points[3 * found + (size_t)k] = (float)x[k];
+            d[k] = foot->p[k] - (float)x[k];
+        }
+        other->distance = disti_foot_length(d);
+        if (foot->status != DIST_RAY_HIT || other->distance < foot->distance) bench->index[found++] = (int)i;
     }
-    if (found > 0) field->eval_fn(field->user, tour->worker, found, bench->points, bench->sdf, NULL);
+    if (found > 0 && tour->leaves > 1)
+        tour->field->eval_fn(tour->field->user, tour->worker, found, bench->points, bench->sdf, NULL);
     for (size_t j = 0; j < found; j++) {
         size_t i = (size_t)bench->index[j];
-        if (!(bench->sdf[j] > -1e-4f * field->radius)) continue;
-        tour->others[i].radius = tour->feet[i].radius;
-        tour->feet[i] = tour->others[i];
-        tour->owner[i] = top;
-    }
-}
-
-/* The way to an instance of an instance: of each scene on it, from the last, which instance. */
-typedef struct disti_foot_way {
-    const struct disti_foot_way *from;
-    const dist_scene *scene;
-    int instance;
-} disti_foot_way;
-
-/* To each instance of the scene, and of those in it; top: the outermost scene's instance that this one is in. */
-static void disti_foot_call(disti_foot_tour *tour, const dist_scene *scene, const disti_chain *chain,
-                            const disti_foot_way *from, int top)
-{
-    for (int k = 0; k < scene->count; k++) {
-        const dist_field *field = &scene->placed[k].field;
-        int inner = field->eval_fn == disti_scene_eval;
-        const disti_foot_way way = {from, scene, k};
-        double center[3];
-        disti_chain_point(chain, scene->ball[k].center, center);
-        double radius = chain->scale * (double)scene->ball[k].radius;
-        size_t count = disti_foot_list(tour, center, radius, inner || from ? -1 : k);
-        if (count == 0) continue;
-        if (inner) {
-            disti_chain next = disti_chain_on(chain, &scene->placed[k]);
-            disti_foot_call(tour, (const dist_scene *)field->user, &next, &way, from ? top : k);
+        disti_foot *foot = &tour->feet[i];
+        const double n[3] = {(double)tour->others[i].normal[0], (double)tour->others[i].normal[1],
+                             (double)tour->others[i].normal[2]};
+        double turned[3];
+        if (tour->leaves > 1 && !(bench->sdf[j] > within)) {
+            tour->doubt[i] |= DISTI_DOUBT_WITHIN;
             continue;
         }
-        for (const disti_foot_way *w = &way; w; w = w->from) disti_scene_only(w->scene, tour->worker, w->instance);
-        disti_foot_visit(tour, count, from ? top : k);
+        disti_rotate(chain->rotation, n, turned);
+        for (int k = 0; k < 3; k++) foot->normal[k] = (float)turned[k];
+        memcpy(foot->best, bench->points + 3 * j, sizeof foot->best);
+        foot->distance = tour->others[i].distance;
+        foot->status = DIST_RAY_HIT;
+    }
+    return asked;
+}
+
+/* A pass over the instances of the scene and of those in it. Returns how often they were asked. */
+static size_t disti_foot_pass(disti_foot_tour *tour, const dist_scene *scene, const disti_chain *chain)
+{
+    size_t asked = 0;
+    disti_scene_work w;
+    for (int k = 0; k < scene->count; k++) {
+        const dist_field *field = &scene->placed[k].field;
+        int inner = field->eval_fn == disti_scene_eval, leaves = disti_scene_leaves(field);
+        disti_chain next = disti_chain_on(chain, &scene->placed[k]);
+        double center[3];
+        disti_chain_point(&next, field->center, center);
+        size_t count = disti_foot_list(tour, center, next.scale * (double)field->radius, leaves, inner);
+        if (count > 0 && inner) {
+            asked += disti_foot_pass(tour, (const dist_scene *)field->user, &next);
+            continue;
+        }
+        if (count > 0 && tour->pass != DISTI_TOUR_CHOOSE) asked += disti_foot_visit(tour, field, &next, count);
+        tour->leaf += leaves;
+    }
+    disti_scene_layout(scene, disti_scene_scratch(scene, tour->worker), &w);
+    *w.queries += asked;
+    return asked;
+}
+
+/* The feet of a scene that f itself leads, by what they found so far. */
+static void disti_foot_led(disti_foot_tour *tour)
+{
+    size_t active = 0;
+    for (size_t i = 0; i < tour->n; i++) {
+        disti_foot *foot = &tour->feet[i], *other = &tour->others[i];
+        int lost = foot->status == DIST_RAY_UNRESOLVED && tour->doubt[i] & DISTI_DOUBT_FOUND;
+        other->status = DIST_RAY_SKIPPED;
+        if (!lost && !(tour->doubt[i] & DISTI_DOUBT_WITHIN)) continue;
+        if (disti_foot_begin(tour->field, foot->p, foot->radius, other)) tour->bench->index[active++] = (int)i;
+    }
+    disti_foot_rounds(tour->field, tour->worker, tour->bench, tour->others, tour->gradient, active);
+    for (size_t i = 0; i < tour->n; i++) {
+        disti_foot *foot = &tour->feet[i], *other = &tour->others[i];
+        if (other->status == DIST_RAY_HIT && (foot->status != DIST_RAY_HIT || other->distance < foot->distance))
+            *foot = *other;
     }
 }
 
-static void disti_foot_others(disti_foot_tour *tour)
+static void disti_foot_scene(disti_foot_tour *tour)
 {
-    const dist_field *field = tour->job->field;
     const disti_chain here = {1.0, {1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0}, {0.0, 0.0, 0.0}};
-    if (!disti_scene_several(field)) return;
-    const dist_scene *scene = (const dist_scene *)field->user;
-    const disti_bench *bench = tour->bench;
-    disti_scene_work w;
-    size_t hits = 0;
+    const dist_scene *scene = (const dist_scene *)tour->field->user;
+    tour->leaves = disti_scene_leaves(tour->field);
+    memset(tour->doubt, 0, sizeof tour->doubt);
     for (size_t i = 0; i < tour->n; i++) {
-        const disti_foot *foot = &tour->feet[i];
-        if (foot->status != DIST_RAY_HIT || foot->sign < 0.0f) continue;
-        memcpy(bench->points + 3 * hits, foot->best, 3 * sizeof(float));
-        bench->index[hits++] = (int)i;
+        tour->first[i] = -1;
+        tour->clear[i] = 3e38f;
     }
-    disti_scene_layout(scene, disti_scene_scratch(scene, tour->worker), &w);
-    disti_scene_settle(scene, tour->worker, hits, bench->points, &w, 1);
-    for (size_t j = 0; j < hits; j++) tour->owner[bench->index[j]] = w.winner[j];
-    disti_foot_call(tour, scene, &here, NULL, -1);
+    for (tour->pass = DISTI_TOUR_CHOOSE; tour->pass <= DISTI_TOUR_REST; tour->pass++) {
+        tour->leaf = 0;
+        disti_foot_pass(tour, scene, &here);
+        for (size_t i = 0; i < tour->n && tour->pass == DISTI_TOUR_CHOOSE; i++) tour->clear[i] = 3e38f;
+    }
+    disti_foot_led(tour);
+    for (size_t i = 0; i < tour->n; i++) {
+        disti_foot *foot = &tour->feet[i];
+        if (foot->status == DIST_RAY_HIT && foot->sign > 0.0f && foot->distance >= foot->radius)
+            foot->distance = DISTI_MIN(foot->distance, tour->clear[i]);
+        if (foot->status != DIST_RAY_UNRESOLVED) continue;
+        if (tour->doubt[i] & DISTI_DOUBT_FINITE) foot->status = DIST_RAY_NOT_FINITE;
+        else if (tour->doubt[i] == 0 && foot->radius < 3e38f) {
+            foot->status = DIST_RAY_MISS;
+            foot->distance = tour->clear[i];
+        }
+    }
 }
 
 static void disti_foot_task(void *arg, int index, int worker)
@@ -11872,21 +11909,23 @@ static void disti_foot_task(void *arg, int index, int worker)
     disti_foot *feet = (disti_foot *)(void *)bench.rest, *others = feet + DISTI_FEET;
     float *gradient = (float *)(void *)(others + DISTI_FEET);
     size_t first = (size_t)index * DISTI_FEET, n = DISTI_MIN((size_t)DISTI_FEET, job->n - first), active = 0;
-    disti_foot_tour tour;
-    tour.job = job;
-    tour.bench = &bench;
-    tour.first = first;
-    tour.n = n;
-    tour.feet = feet;
-    tour.others = others;
-    tour.gradient = gradient;
-    tour.worker = worker;
-    for (size_t i = 0; i < n; i++)
-        if (disti_foot_begin(job, first + i, &feet[i])) bench.index[active++] = (int)i;
-    disti_scene_whole(field, worker, 1);
-    disti_foot_rounds(field, worker, &bench, feet, gradient, active);
-    disti_foot_others(&tour);
-    disti_scene_whole(field, worker, 0);
+    for (size_t i = 0; i < n; i++) {
+        const float *p = job->points + job->stride * (first + i);
+        if (disti_foot_begin(field, p, job->contacts ? p[3] : 3e38f, &feet[i])) bench.index[active++] = (int)i;
+    }
+    if (field->eval_fn == disti_scene_eval) {
+        disti_foot_tour tour;
+        tour.field = field;
+        tour.bench = &bench;
+        tour.n = n;
+        tour.feet = feet;
+        tour.others = others;
+        tour.gradient = gradient;
+        tour.worker = worker;
+        disti_foot_scene(&tour);
+    } else {
+        disti_foot_rounds(field, worker, &bench, feet, gradient, active);
+    }
     for (size_t i = 0; i < n; i++) {
         disti_foot *foot = &feet[i];
         float d[3] = {foot->p[0] - foot->x[0], foot->p[1] - foot->x[1], foot->p[2] - foot->x[2]};

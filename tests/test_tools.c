@@ -231,8 +231,8 @@ TEST(what_is_far_away_finds_its_nearest_point_and_what_it_touches)
     dist_context_destroy(ctx);
 }
 
-/* A scene's own f ends in a valley around each instance's sphere, which must not hold a point on its way: a torus in
-   each of two orientations, a box, and a ball in a sphere twice its size, alone or as a scene in the scene. */
+/* A scene's own f falls outward from an instance's sphere and tells of no other instance: a torus in each of two
+   orientations, a box, and a ball in a sphere twice its size, alone, together, and as a scene in the scene. */
 TEST(points_find_the_nearest_instance_of_a_scene)
 {
     enum { PARTS = 4 };
@@ -274,6 +274,7 @@ TEST(points_find_the_nearest_instance_of_a_scene)
             for (int k = 0; k < 3; k++) points[3 * i + k] = placed.center[k] + share * points[3 * i + k];
         }
         CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &placed, RAYS, points, closest, distance, status), ctx);
+        double asked = (double)dist_scene_queries(inner) / RAYS;
         for (int i = RAYS; i-- > 0;) {
             double p[3], f = 1e30;
             point_of(points + 3 * i, p);
@@ -298,22 +299,80 @@ TEST(points_find_the_nearest_instance_of_a_scene)
             }
             if (nested) f *= 2;
             lost += status[i] != DIST_RAY_HIT;
-            wrong += status[i] == DIST_RAY_HIT && fabs(f - (double)distance[i]) > 2e-3 * (double)placed.radius;
+            wrong += status[i] == DIST_RAY_HIT &&
+                     fabs(f - (double)distance[i]) > (band == 0 ? 1e-4 : 1e-3) * (double)placed.radius;
             for (int k = 3; k-- > 0;) points[4 * i + k] = points[3 * i + k];
             points[4 * i + 3] = (float)(fmax(f, 0) + 0.02 * (double)placed.radius);
         }
         CHECK_STATUS(DIST_OK, dist_field_collide(ctx, &placed, RAYS, points, contacts), ctx);
         for (int i = 0; i < RAYS; i++) told += contacts[i].status != DIST_RAY_HIT;
         CHECK_EQUAL(0, lost);
-        CHECK(wrong * 250 <= RAYS);
-        CHECK(told * 250 <= RAYS);
+        CHECK(wrong <= (band == 0 ? 0 : 3));
+        CHECK(told <= (band == 0 ? 0 : 3));
+        CHECK(band > 0 || asked <= 40.0);
         if (test_state.verbose)
-            printf("    %d of %d from part %d, %g to %g radii away%s: %d not found, %d wrong, %d told clear of %d\n",
-                   count, PARTS, first, least[band], most[band], nested ? ", in a scene" : "", lost, wrong, told,
-                   RAYS);
+            printf("    %d of %d from part %d, %g to %g radii away%s: %d not found, %d wrong, %d told clear of %d; "
+                   "%.1f queries a point\n", count, PARTS, first, least[band], most[band],
+                   nested ? ", in a scene" : "", lost, wrong, told, RAYS, asked);
         dist_scene_destroy(outer);
         dist_scene_destroy(inner);
     }
+    dist_context_destroy(ctx);
+}
+
+/* Two balls that overlap, of radius r at -+h on the x axis. What is of one in the other is no surface: from inside the
+   nearest point is of a ball outside of the other, or of the circle where they meet. */
+static double two_balls_distance(double h, double r, const double p[3])
+{
+    double around = shape_length(p[1], p[2], 0), ring = sqrt(r * r - h * h);
+    double least = shape_length(p[0], around - ring, 0), within = 1e30;
+    for (int side = -1; side < 2; side += 2) {
+        double x = p[0] - side * h, length = shape_length(x, around, 0);
+        within = fmin(within, length - r);
+        if ((x / length * r + side * h) * side >= 0) least = fmin(least, fabs(length - r));
+    }
+    return within < 0 ? -least : least;
+}
+
+TEST(what_is_of_one_instance_in_another_is_no_surface)
+{
+    dist_context *ctx = shape_context();
+    const float ball[4] = {0, 0, 0, 0.5f};
+    dist_field field = dist_field_sphere(ball);
+    dist_instance two[2];
+    memset(two, 0, sizeof two);
+    two[0].field = two[1].field = &field;
+    two[0].placement.translation[0] = -0.3f;
+    two[1].placement.translation[0] = 0.3f;
+    dist_scene *scene = dist_scene_create(ctx, 2, two);
+    dist_field both = dist_scene_field(scene);
+    test_random random = test_random_seed(97);
+    int wrong = 0, inside = 0, overlap = 0;
+    double residual = 0, worst = 0;
+    make_points(&random, 3, 0.8f);
+    CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &both, RAYS, points, closest, distance, status), ctx);
+    for (int i = 0; i < RAYS; i++) {
+        double p[3], q[3], f;
+        point_of(points + 3 * i, p);
+        point_of(closest + 3 * i, q);
+        f = two_balls_distance(0.3, 0.5, p);
+        CHECK_EQUAL(DIST_RAY_HIT, status[i]);
+        double left = shape_length(q[0] + 0.3, q[1], q[2]), right = shape_length(q[0] - 0.3, q[1], q[2]);
+        residual = fmax(residual, fabs(fmin(left, right) - 0.5));
+        inside += f < 0;
+        overlap += fmax(shape_length(p[0] - 0.3, p[1], p[2]), shape_length(p[0] + 0.3, p[1], p[2])) < 0.5;
+        if (f > 0) worst = fmax(worst, fabs(f - (double)distance[i]));
+        CHECK((f < 0) == (distance[i] < 0) || fabs(f) < 1e-5);
+        wrong += fabs(f - (double)distance[i]) > 1e-3;
+    }
+    CHECK(inside > 300 && overlap > 60);
+    CHECK_NEAR(0, residual, 1e-4);
+    CHECK_NEAR(0, worst, 1e-4);
+    CHECK(wrong * 20 <= inside);
+    if (test_state.verbose)
+        printf("    residual %.2g, outside off by %.2g; %d inside, %d in both, %d another part\n", residual, worst,
+               inside, overlap, wrong);
+    dist_scene_destroy(scene);
     dist_context_destroy(ctx);
 }
 
@@ -1007,6 +1066,7 @@ int main(int argc, char **argv)
     RUN(closest_points_of_distances_are_exact);
     RUN(what_is_far_away_finds_its_nearest_point_and_what_it_touches);
     RUN(points_find_the_nearest_instance_of_a_scene);
+    RUN(what_is_of_one_instance_in_another_is_no_surface);
     RUN(fields_far_from_the_origin_are_found_to_within_what_floats_can_tell);
     RUN(closest_points_of_other_fields_are_on_the_surface_and_near);
     RUN(closest_points_of_networks_lie_on_their_surface);

@@ -605,7 +605,8 @@ typedef struct dist_hit {
 /* Traces n rays (origins (n, 3), directions (n, 3) of any length from 1.2e-38 on) with the guarded tracer: picking,
    shadows, visibility. The first surface in front of each origin; with how.any_hit any of them. A ray that is 0 or not
    finite is DIST_RAY_NOT_FINITE. No cone and no neighbor helps a free ray to see what is thin: with how.certified it
-   asks more, and steps over nothing as far as the Lipschitz figures are bounds. stats may be NULL. */
+   asks more, and steps over nothing as far as the Lipschitz figures are bounds. A hit is as often just inside as just
+   outside: a shadow ray sets out a little along the normal, some thousandths of the radius. stats may be NULL. */
 DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size_t n, const float *origins,
                                 const float *directions, const dist_render_desc *how, dist_hit *hits,
                                 dist_stats *stats);
@@ -665,7 +666,7 @@ DIST_API dist_status dist_field_collide(dist_context *ctx, const dist_field *fie
 typedef struct dist_images {
     float *depth;          /* z in camera space; how.background where the ray is neither a hit nor UNRESOLVED */
     float *distance;       /* along the ray; likewise */
-    float *normal;         /* (h, w, 3), unit, outward; 0 at a miss */
+    float *normal;         /* (h, w, 3), unit, outward, in how.normal_space (the camera's); 0 at a miss */
     float *silhouette;     /* min |f| along the ray - epsilon, signed: < 0 at a hit, > 0 at a miss. Far from the
                               outline, from |f| of about .05 of the radius on, in coarse pictures from more, it is
                               interpolated or another local minimum; of a ray beside the bounding sphere its distance

@@ -611,13 +611,14 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
                                 const float *directions, const dist_render_desc *how, dist_hit *hits,
                                 dist_stats *stats);
 
-/* The nearest point of the surface to each of n points, found from where |f| falls: steps along the gradient onto the
-   surface, then along the surface as long as that brings it nearer, then a look around for nearer parts. Of a distance
-   as far off as the nearest to within 1e-4 of the radius, 1e-3 from a radius outside the bounding sphere on, where one
-   point in thousands also ends on a part that is not the nearest; else mostly the nearest, at the least a local one:
-   where a decoder's f is no distance far from the surface, many points well outside the bounding sphere end on another
-   part, and some spheres of dist_field_collide that touch are told to be clear. Of a scene each instance that may be
-   nearest is gone to by itself; what is of one within another is no surface.
+/* The nearest point of the surface to each of n points: steps along the gradient onto the surface, then along the
+   surface as long as that brings it nearer, then a look around, through the cells of an octree (16 along each side of
+   the cube around the bounding sphere) that the figures for how.certified do not show to be empty. Of a distance it is
+   as far off as the nearest to within 1e-4 of the radius; of a trained decoder mostly to within a 500th, from far away,
+   too: two parts of the surface in one cell may be taken for one. A point alone asks for 2 to some hundred samples,
+   or more where f tells little of the distance; of a thousand in one call each asks for 10 to 150, as they share the
+   cells, and a cache spares those that it shows to be empty. Of a scene each instance that may be nearest is gone to by
+   itself; what is of one within another is no surface.
    closest (n, 3); distance (n) signed, below 0 inside, and status (n) may be NULL: DIST_RAY_HIT, DIST_RAY_UNRESOLVED
    (no surface found: the last point tried), DIST_RAY_NOT_FINITE. Nothing is asked outside the bounding sphere. */
 DIST_API dist_status dist_field_closest_point(dist_context *ctx, const dist_field *field, size_t n,
@@ -11398,34 +11399,51 @@ DIST_API dist_field dist_cache_field(const dist_cache *cache)
 DIST_API unsigned long long dist_cache_queries(const dist_cache *cache) { return cache ? cache->queries : 0; }
 
 /* Nearest points and contacts. Steps of Newton along the gradient lead from p onto the surface, P; of a distance that
-   is all. (Where f is flat they are whole ones only to a 50th of the radius. Where |f| is least without a crossing, as
-   48 steps without one tell, the search goes on aside, by a 20th of the radius, then by twice as far each 12 steps.)
-   From there it slides: with each step down also along the surface, toward where its tangent plane is nearest
-   to p. That takes a few queries where the surface is smooth, and may come to no end in a crease. Then, from the
-   nearest x found, a share of the way back to p and down again, x' = P(x + share (p - x)), which stays where x is
-   nearest, in creases too, cannot overshoot where the surface bends away, and may find another part of the surface,
-   before this one; a quarter of the share where that came no nearer. Where f at p does not bear out what was found,
-   samples around p tell of nearer parts that no gradient leads to, up to three times. */
+   is all. (Where f is flat they are whole ones only to a 50th of the radius.) From there it slides: with each step down
+   also along the surface, toward where its tangent plane is nearest to p. That takes a few queries where the surface
+   is smooth, and may come to no end in a crease. Then it looks around for nearer parts that no gradient leads to: in
+   the cells of an octree that are not shown to be empty, those nearest to p first, a few steps of Newton's from their
+   centers tell of a place on the surface; from the nearest of them it slides again. What a cell tells is told to all
+   points of a task. At last, from the nearest x found, a share of the way back to p and down again,
+   x' = P(x + share (p - x)), which stays where x is nearest, in creases too, cannot overshoot where the surface bends
+   away, and may find another part of the surface, before this one; a quarter of the share where that came no nearer. */
+typedef struct disti_foot_cell {
+    float empty;   /* there is no surface nearer to its center */
+    float seed[3]; /* the next sample; of a leaf that is `on` a place on the surface */
+    unsigned char steps, on, done, asked; /* asked: a foot has a sample under way */
+} disti_foot_cell;
+
+typedef struct disti_foot_tree {
+    const dist_field *field;
+    disti_foot_cell *cells; /* cell 1: the cube around the bounding sphere; 8 k to 8 k + 7: cell k cut in eight */
+    int used;
+} disti_foot_tree;
+
 typedef struct disti_foot {
     float p[3], x[3];
     float best[3], normal[3]; /* nearest surface point so far, grad f there at unit length; before there is one: the
                                  last samples outside and inside */
     float distance;  /* from p to it, 3e38: none yet; of a miss: the least there can be */
     float least;     /* no surface is nearer to p than this */
-    float told;      /* |f| at p, or at where p is moved to in the bounding sphere, and the way there */
     float radius;    /* p is a sphere's center; 3e38: none */
     float away;      /* of p from the bounding sphere; 0: within */
     float f, damping, share;
     float rest[3], relax; /* the last slide's, and by which share of it */
     float from[3], drift[3]; /* of a pull: the nearest point before it, and by how much more it is to go on */
     float sign;
-    float hope[3], hoped, before; /* of a look around: the nearest place foretold, how far; the distance at its start */
+    int cell;        /* of a look around: which is next; 0: none is under way */
+    float hope[3];   /* the nearest place that was told of so far */
+    double hoped, wanted, tried; /* how much nearer that is; what is worth it; how much nearer the hope before is */
     unsigned char status, steps, slides, sides; /* sides: 1 a sample was outside, 2 inside */
-    unsigned char look, looks; /* samples of this look around, 0: none; looks so far */
-    unsigned char pulled;      /* the last move was a pull */
+    unsigned char begun;  /* steps when it set out for the surface the last time */
+    unsigned char landed; /* it has been on the surface since */
+    unsigned char pulled; /* the last move was a pull */
+    unsigned char settled; /* no way along the surface leads nearer to p */
+    unsigned char looks, found, waits; /* looks so far; the last one found something; the sample is another foot's */
 } disti_foot;
 
-enum { DISTI_FEET = 512, DISTI_FOOT_STEPS = 160, DISTI_FOOT_TURN = 48, DISTI_FOOT_SLIDES = 16 }; /* slides first */
+enum { DISTI_FEET = 512, DISTI_FOOT_STEPS = 160, DISTI_FOOT_TURN = 48, DISTI_FOOT_SLIDES = 16, DISTI_FOOT_LOOKS = 5,
+       DISTI_FOOT_LEAVES = 8 * 8 * 8 * 8, DISTI_FOOT_CELLS = 2 * DISTI_FOOT_LEAVES, DISTI_FOOT_NEWTON = 12 };
 
 /* Of a way to a point as far off as a float can say, whose square it cannot. */
 static float disti_foot_length(const float d[3])
@@ -11474,7 +11492,7 @@ static float disti_foot_arrive(disti_foot *foot, const float *n)
 static int disti_foot_slide(const dist_field *field, disti_foot *foot, const float *n, float down, int on)
 {
     float d[3], rest[3], along = 0.0f, square = 0.0f, change = 0.0f, both = 0.0f;
-    float reach = field->clamp > 0.0f ? 0.5f * field->clamp : field->radius;
+    float reach = DISTI_MIN(0.1f * field->radius, field->clamp > 0.0f ? 0.5f * field->clamp : field->radius);
     for (int i = 0; i < 3; i++) {
         d[i] = foot->p[i] - foot->x[i];
         along += d[i] * n[i];
@@ -11524,60 +11542,10 @@ static int disti_foot_pull(const dist_field *field, disti_foot *foot, float gain
     disti_foot_move(field, foot->x, foot->drift, 1.0f);
     disti_foot_move(field, foot->x, d, DISTI_MIN(foot->share * way, reach));
     foot->pulled = 1;
+    foot->begun = foot->steps;
     foot->damping = 1.0f;
     foot->f = 0.0f;
     return 1;
-}
-
-/* The next of 12 samples around p, at the corners of an icosahedron half way between where the surface can be at the
-   nearest and the nearest point so far; after the last one off to the nearest place that one of them foretold. 0: there
-   is none nearer, or the last look found none. */
-static int disti_foot_look(const dist_field *field, disti_foot *foot)
-{
-    float within = foot->sign > 0.0f ? DISTI_MIN(foot->distance, foot->radius) : foot->distance;
-    if (foot->look == 0) {
-        int vain = foot->looks > 0 && foot->distance > foot->before - 1e-3f * field->radius;
-        if (vain || foot->looks == 3 || foot->steps + 24 > DISTI_FOOT_STEPS)
-            return disti_foot_pull(field, foot, field->radius);
-        foot->looks++;
-        foot->pulled = 0;
-        foot->before = foot->distance;
-        foot->hoped = 3e38f;
-    } else if (foot->look == 12) {
-        foot->look = 0;
-        if (!(foot->hoped < 0.98f * within)) return disti_foot_pull(field, foot, field->radius);
-        memcpy(foot->x, foot->hope, sizeof foot->x);
-        foot->damping = 1.0f;
-        foot->share = 0.5f;
-        foot->f = 0.0f;
-        return 1;
-    }
-    int k = foot->look++, axis = k / 4;
-    float corner[3];
-    corner[axis] = 0.0f;
-    corner[(axis + 1) % 3] = k & 1 ? 0.52573111f : -0.52573111f;
-    corner[(axis + 2) % 3] = k & 2 ? 0.85065081f : -0.85065081f;
-    memcpy(foot->x, foot->p, sizeof foot->x);
-    disti_foot_move(field, foot->x, corner, 0.5f * (foot->least + within));
-    return 1;
-}
-
-/* What the sample f with gradient n * slope at x foretells: where f ends if it is linear, between p and x if it has
-   another sign than at p. */
-static void disti_foot_looked(disti_foot *foot, float f, const float *n, float slope)
-{
-    float at[3], d[3];
-    int crosses = f * foot->sign < 0.0f;
-    float told = foot->told - foot->away, size = f < 0.0f ? -f : f;
-    for (int i = 0; i < 3; i++) {
-        if (crosses) at[i] = foot->p[i] + (foot->x[i] - foot->p[i]) * (told / (told + size));
-        else at[i] = foot->x[i] - f / slope * n[i];
-        d[i] = foot->p[i] - at[i];
-    }
-    float away = disti_foot_length(d);
-    if (!(away < foot->hoped)) return;
-    memcpy(foot->hope, at, sizeof at);
-    foot->hoped = away;
 }
 
 /* No surface is nearer than this to where |f| = f, by the figures for how.certified. */
@@ -11587,13 +11555,188 @@ static float disti_certified_empty(const dist_field *field, float f)
     return f > from ? from / near + (f - from) / disti_certified_far(field) : f / near;
 }
 
-/* One sample f with gradient g at x. 1: another one is wanted at the new x. */
-static int disti_foot_advance(const dist_field *field, disti_foot *foot, float f, const float *g)
+/* How much nearer to p y is than x, in all the digits that distances from far away lose. */
+static double disti_foot_gain(const disti_foot *foot, const double x[3], const double y[3])
 {
+    double gain = 0.0, from_x = 0.0, from_y = 0.0;
+    for (int i = 0; i < 3; i++) {
+        double p = (double)foot->p[i];
+        gain += (y[i] - x[i]) * (2.0 * p - y[i] - x[i]);
+        from_x += (p - x[i]) * (p - x[i]);
+        from_y += (p - y[i]) * (p - y[i]);
+    }
+    return gain / DISTI_MAX(sqrt(from_x) + sqrt(from_y), 1e-300);
+}
+
+/* The center of a cell and half its side. */
+static double disti_foot_cube(const dist_field *field, int cell, double center[3])
+{
+    double scale = 1.0, at[3] = {0.0, 0.0, 0.0}, radius = (double)field->radius;
+    for (; cell > 1; cell >>= 3, scale *= 2.0)
+        for (int i = 0; i < 3; i++) at[i] += cell >> i & 1 ? scale : -scale;
+    for (int i = 0; i < 3; i++) center[i] = (double)field->center[i] + at[i] / scale * radius;
+    return radius / scale;
+}
+
+/* The cell after foot->cell: the part of it that is nearest to p, or else the next one that it is a part with. */
+static int disti_foot_next(const dist_field *field, const disti_foot *foot, int inner)
+{
+    double center[3];
+    for (int cell = foot->cell; cell > 0; cell >>= 3, inner = 0) {
+        int corner = 0, nearest = inner ? cell : cell >> 3, turn;
+        (void)disti_foot_cube(field, nearest, center);
+        for (int i = 0; i < 3; i++) corner |= ((double)foot->p[i] > center[i]) << i;
+        turn = inner ? 0 : ((cell & 7) ^ corner) + 1;
+        if (inner || (turn < 8 && nearest > 0)) return 8 * nearest + (turn ^ corner);
+    }
+    return 0;
+}
+
+/* Whether there is something of a cell in the bounding sphere that is nearer than what is hoped for. */
+static int disti_foot_promising(const dist_field *field, const disti_foot *foot, const double from[3])
+{
+    double center[3], half = disti_foot_cube(field, foot->cell, center), to_p[3], out[3];
+    double radius = (double)field->radius;
+    for (int i = 0; i < 3; i++) {
+        double low = center[i] - half, high = center[i] + half, c = (double)field->center[i];
+        to_p[i] = DISTI_MIN(DISTI_MAX((double)foot->p[i], low), high);
+        out[i] = DISTI_MIN(DISTI_MAX(c, low), high) - c;
+    }
+    if (disti_dot(out, out) >= radius * radius) return 0;
+    return disti_foot_gain(foot, from, to_p) > DISTI_MAX(foot->hoped, foot->wanted);
+}
+
+/* A cell's sample f with gradient n * slope at its seed. 1: another one is wanted. */
+static int disti_foot_told(const dist_field *field, const disti_foot *foot, disti_foot_cell *cell, float f,
+                           const float *n, float slope)
+{
+    double center[3], half = disti_foot_cube(field, foot->cell, center);
+    float size = f < 0.0f ? -f : f, lipschitz = field->lipschitz > 0.0f ? field->lipschitz : 1.0f;
+    float side = (float)half, step = DISTI_MIN(DISTI_MAX(f / DISTI_MAX(slope, 0.02f * lipschitz), -side), side);
+    int finite = disti_finite(f) && disti_finite(slope), away = 0;
+    if (cell->steps++ == 0) cell->empty = finite ? disti_certified_empty(field, size) : 3e38f;
+    for (int i = 0; i < 3 && finite; i++) {
+        cell->seed[i] -= step * n[i];
+        away |= !(fabs((double)cell->seed[i] - center[i]) <= 4.0 * half);
+    }
+    cell->on = finite && !away && size <= 0.01f * side * DISTI_MAX(slope, 0.25f);
+    cell->done = foot->cell < DISTI_FOOT_LEAVES || (double)cell->empty >= 1.7321 * half || cell->on || away ||
+                 !finite || cell->steps == DISTI_FOOT_NEWTON;
+    cell->asked = !cell->done;
+    return !cell->done;
+}
+
+/* Begins a look around from the nearest point so far, or from the center. 0: there was enough of it. */
+static int disti_foot_look_begin(disti_foot_tree *tree, disti_foot *foot, const double from[3])
+{
+    double radius = (double)tree->field->radius, leaf = radius / 16.0, d[3], hope[3];
+    int lost = foot->status != DIST_RAY_HIT;
+    if (foot->looks == DISTI_FOOT_LOOKS || foot->steps + 24 > DISTI_FOOT_STEPS) return 0;
+    memcpy(foot->from, foot->x, sizeof foot->from);
+    for (int i = 0; i < 3; i++) {
+        d[i] = (double)foot->p[i] - from[i];
+        hope[i] = (double)foot->hope[i];
+    }
+    double reach = foot->sign > 0.0f ? (double)foot->radius + leaf : 1e300, needed = sqrt(disti_dot(d, d)) - reach;
+    foot->tried = foot->found ? disti_foot_gain(foot, from, hope) : 1e300;
+    foot->hoped = lost ? -1e300 : DISTI_MAX(needed, 0.0);
+    foot->wanted = lost ? -1e300 : DISTI_MAX(needed, 1e-3 * radius);
+    foot->looks++;
+    foot->found = 0;
+    if (!lost && (double)(foot->distance - foot->least) < foot->wanted) return 0;
+    if (!(foot->tried > foot->hoped)) return 0; /* what is left is farther than what was found since */
+    if (!tree->used) memset(tree->cells, 0, DISTI_FOOT_CELLS * sizeof *tree->cells);
+    tree->used = foot->cell = 1;
+    return 1;
+}
+
+/* Notes the seed of a leaf if it is the nearest, but for those at what is nearest already or has been tried. */
+static void disti_foot_note(const dist_field *field, disti_foot *foot, const double from[3], const float *seed)
+{
+    const double at[3] = {(double)seed[0], (double)seed[1], (double)seed[2]};
+    double gain = disti_foot_gain(foot, from, at), apart = 0.0;
+    for (int i = 0; i < 3; i++) apart = DISTI_MAX(apart, fabs(at[i] - from[i]));
+    if (!(gain > foot->hoped && gain < foot->tried)) return;
+    if (gain < foot->wanted && apart < 0.1 * (double)field->radius) return;
+    foot->hoped = gain;
+    foot->found = 1;
+    memcpy(foot->hope, seed, sizeof foot->hope);
+}
+
+/* Goes on with a look around, or begins one. 1: a sample is wanted at x: of a cell, of what was found, or else of a
+   pull, or where it set out from, if it has not found the surface yet. */
+static int disti_foot_look(disti_foot_tree *tree, disti_foot *foot)
+{
+    const dist_field *field = tree->field;
+    const float *at = foot->status == DIST_RAY_HIT ? foot->best : field->center, zero[3] = {0.0f, 0.0f, 0.0f};
+    const double from[3] = {(double)at[0], (double)at[1], (double)at[2]};
+    foot->waits = 0;
+    if (foot->cell == 0 && !disti_foot_look_begin(tree, foot, from)) foot->found = 0;
+    for (int inner; foot->cell > 0; foot->cell = disti_foot_next(field, foot, inner)) {
+        disti_foot_cell *cell = &tree->cells[foot->cell];
+        double center[3], half = disti_foot_cube(field, foot->cell, center);
+        double way[3] = {center[0] - from[0], center[1] - from[1], center[2] - from[2]};
+        inner = 0;
+        if (!disti_foot_promising(field, foot, from)) continue;
+        if (foot->cell < DISTI_FOOT_LEAVES && foot->status == DIST_RAY_HIT && disti_dot(way, way) < 3.0 * half * half) {
+            inner = 1; /* it is not empty */
+            continue;
+        }
+        if (!cell->done) {
+            foot->waits = cell->asked;
+            if (foot->waits) return 1;
+            for (int i = 0; i < 3; i++) cell->seed[i] = (float)center[i];
+            disti_foot_move(field, cell->seed, zero, 0.0f);
+            cell->empty = field->cache ? disti_cache_clear(field->cache, cell->seed) : 0.0f;
+            cell->done = (double)cell->empty >= 1.7321 * half;
+            if (cell->done) continue;
+            memcpy(foot->x, cell->seed, sizeof foot->x);
+            cell->asked = 1;
+            return 1;
+        }
+        if ((double)cell->empty >= 1.7321 * half) continue;
+        inner = foot->cell < DISTI_FOOT_LEAVES;
+        if (cell->on) disti_foot_note(field, foot, from, cell->seed);
+    }
+    foot->begun = foot->steps;
+    if (!foot->found && foot->status == DIST_RAY_HIT)
+        return !foot->settled && disti_foot_pull(field, foot, field->radius);
+    memcpy(foot->x, foot->found ? foot->hope : foot->from, sizeof foot->x);
+    if (!foot->found) return 1;
+    foot->damping = foot->relax = 1.0f;
+    foot->f = 0.0f;
+    foot->slides = foot->landed = foot->sides = 0;
+    return 1;
+}
+
+/* Of a foot without a surface point: notes the sides of it. 1: it goes to and fro in a thin solid, so it bisects. */
+static int disti_foot_bisects(const dist_field *field, disti_foot *foot, float f, const float *n, int since)
+{
+    memcpy(f > 0.0f ? foot->best : foot->normal, foot->x, sizeof foot->x);
+    foot->sides |= (unsigned char)(f > 0.0f ? 1 : 2);
+    if (foot->sides < 2 || since < DISTI_FOOT_TURN / 2) return 0;
+    if (foot->sides == 2) {
+        memcpy(foot->best, foot->x, sizeof foot->x);
+        disti_foot_move(field, foot->best, n, 2.0f * field->radius);
+        foot->sides = 3;
+    }
+    for (int i = 0; i < 3; i++) foot->x[i] = 0.5f * (foot->best[i] + foot->normal[i]);
+    return 1;
+}
+
+/* How far off the surface is at the least by what was looked at: of a sphere, little more than its radius. */
+static float disti_foot_least(const dist_field *field, const disti_foot *foot)
+{
+    return foot->sign > 0.0f ? DISTI_MIN(foot->distance, foot->radius + field->radius / 16.0f) : foot->distance;
+}
+
+/* One sample f with gradient g at x. 1: another one is wanted at the new x. */
+static int disti_foot_advance(disti_foot_tree *tree, disti_foot *foot, float f, const float *g)
+{
+    const dist_field *field = tree->field;
     float lipschitz = field->lipschitz > 0.0f ? field->lipschitz : 1.0f, size = f < 0.0f ? -f : f;
     float slope = disti_length(g[0], g[1], g[2]), n[3];
-    if (!disti_finite(f) || !disti_finite(slope)) {
-        if (foot->look > 0) return disti_foot_look(field, foot);
+    if (foot->cell == 0 && (!disti_finite(f) || !disti_finite(slope))) {
         foot->status = DIST_RAY_NOT_FINITE;
         return 0;
     }
@@ -11602,17 +11745,17 @@ static int disti_foot_advance(const dist_field *field, disti_foot *foot, float f
         float length = disti_length(n[0], n[1], n[2]);
         for (int i = 0; i < 3; i++) n[i] = length > 1e-6f * field->radius ? n[i] / length : i == 0 ? 1.0f : 0.0f;
     }
-    if (foot->look > 0) {
-        foot->steps++;
-        if (slope > 1e-6f) disti_foot_looked(foot, f, n, slope);
-        return disti_foot_look(field, foot);
+    if (foot->cell > 0) {
+        disti_foot_cell *cell = &tree->cells[foot->cell];
+        int more = disti_foot_told(field, foot, cell, f, n, slope);
+        memcpy(foot->x, cell->seed, sizeof foot->x);
+        return more || disti_foot_look(tree, foot);
     }
     if (foot->steps++ == 0) {
         float asked = f > 0.0f || foot->away <= 0.0f ? size : 0.0f;
         const float clear[3] = {foot->away, disti_certified_empty(field, asked), 0.0f};
         foot->sign = f < 0.0f && foot->away <= 0.0f ? -1.0f : 1.0f;
         foot->least = disti_foot_length(clear);
-        foot->told = size + foot->away;
         if (foot->sign > 0.0f && foot->radius < 3e38f && foot->least >= foot->radius) {
             foot->status = DIST_RAY_MISS;
             foot->distance = foot->least;
@@ -11622,40 +11765,21 @@ static int disti_foot_advance(const dist_field *field, disti_foot *foot, float f
     int on = size <= (1.5e-6f * field->radius + disti_field_noise(field)) * DISTI_MAX(slope, 0.25f);
     float gain = on ? disti_foot_arrive(foot, n) : 0.0f;
     float exact = 2e-5f * DISTI_MIN(foot->least, field->radius) + 2e-6f * field->radius;
+    if (on) foot->landed = 1;
     if (on && foot->distance <= foot->least + exact) return 0;
     if (foot->steps >= DISTI_FOOT_STEPS) return 0;
-    if (foot->steps < DISTI_FOOT_SLIDES && foot->status == DIST_RAY_HIT && slope > (on ? 0.1f : 0.5f) * lipschitz &&
+    int since = foot->steps - foot->begun;
+    foot->settled = 0;
+    if (since < DISTI_FOOT_SLIDES && foot->landed && !foot->pulled && slope > (on ? 0.1f : 0.5f) * lipschitz &&
         (on || size < 0.02f * field->radius)) {
         if (disti_foot_slide(field, foot, n, f / slope, on)) return 1;
-        float along = foot->distance * slope; /* about as far as f said at p, and f nearly a distance; not slid off */
-        int nearest = gain > -1e-5f * field->radius;
-        if (nearest && along <= 1.2f * foot->told && along >= 0.8f * foot->told && slope > 0.5f * lipschitz) return 0;
+        foot->settled = gain > -1e-5f * field->radius;
     }
-    if (on) {
-        int tires = foot->looks == 0 && foot->steps >= DISTI_FOOT_TURN; /* in a crease pulls come to no end */
-        return (!tires && disti_foot_pull(field, foot, gain)) || disti_foot_look(field, foot);
-    }
-    if (foot->status != DIST_RAY_HIT) {
-        memcpy(f > 0.0f ? foot->best : foot->normal, foot->x, sizeof foot->x);
-        foot->sides |= (unsigned char)(f > 0.0f ? 1 : 2);
-        if (foot->sides >= 2 && foot->steps >= DISTI_FOOT_TURN) { /* to and fro in a thin solid: bisect */
-            if (foot->sides == 2) {
-                memcpy(foot->best, foot->x, sizeof foot->x);
-                disti_foot_move(field, foot->best, n, 2.0f * field->radius);
-                foot->sides = 3;
-            }
-            for (int i = 0; i < 3; i++) foot->x[i] = 0.5f * (foot->best[i] + foot->normal[i]);
-            return 1;
-        }
-        if (foot->steps % 12 == 0 && foot->steps >= DISTI_FOOT_TURN) { /* where |f| is least: off to elsewhere */
-            const float aside[3] = {n[1], n[2], n[0]};
-            int times = 1 << (foot->steps - DISTI_FOOT_TURN) / 12 % 4;
-            disti_foot_move(field, foot->x, aside, 0.05f * (float)times * field->radius);
-            foot->damping = 1.0f;
-            foot->f = 0.0f;
-            return 1;
-        }
-    }
+    int hit = foot->status == DIST_RAY_HIT; /* then a crease off the surface is not to hold it */
+    if (on || (hit && since >= DISTI_FOOT_SLIDES + 8))
+        return foot->pulled ? disti_foot_pull(field, foot, gain) : disti_foot_look(tree, foot);
+    if (!hit && since >= DISTI_FOOT_TURN && foot->looks < DISTI_FOOT_LOOKS) return disti_foot_look(tree, foot);
+    if (!hit && disti_foot_bisects(field, foot, f, n, since)) return 1;
     if (f * foot->f < 0.0f && size > 0.5f * (foot->f < 0.0f ? -foot->f : foot->f)) foot->damping *= 0.5f;
     foot->f = f;
     double flat = (double)size / (0.02 * (double)field->radius); /* where f is small, too: a whole step of Newton's */
@@ -11704,15 +11828,23 @@ static size_t disti_foot_rounds(const dist_field *field, int worker, const disti
                                 float *gradient, size_t active)
 {
     size_t asked = 0;
+    disti_foot_tree tree = {field, (disti_foot_cell *)(void *)(gradient + 3 * DISTI_FEET), 0};
     while (active > 0) {
-        size_t kept = 0;
-        asked += active;
-        for (size_t i = 0; i < active; i++)
-            memcpy(bench->points + 3 * i, feet[bench->index[i]].x, 3 * sizeof(float));
-        field->eval_fn(field->user, worker, active, bench->points, bench->sdf, gradient);
-        for (size_t i = 0; i < active; i++)
-            if (disti_foot_advance(field, &feet[bench->index[i]], bench->sdf[i], gradient + 3 * i))
+        size_t kept = 0, asks = 0, told = 0;
+        for (size_t i = 0; i < active; i++) {
+            const disti_foot *foot = &feet[bench->index[i]];
+            if (!foot->waits) memcpy(bench->points + 3 * asks++, foot->x, sizeof foot->x);
+        }
+        field->eval_fn(field->user, worker, asks, bench->points, bench->sdf, gradient);
+        for (size_t i = 0; i < active; i++) {
+            disti_foot *foot = &feet[bench->index[i]];
+            size_t k = told;
+            if (!foot->waits) told++;
+            if (foot->waits ? disti_foot_look(&tree, foot)
+                            : disti_foot_advance(&tree, foot, bench->sdf[k], gradient + 3 * k))
                 bench->index[kept++] = bench->index[i];
+        }
+        asked += asks;
         active = kept;
     }
     return asked;
@@ -11796,6 +11928,8 @@ static size_t disti_foot_visit(disti_foot_tour *tour, const dist_field *field, c
             tour->clear[i] = DISTI_MIN(tour->clear[i], (float)((double)other->distance * chain->scale));
         if (other->sign < 0.0f) foot->sign = -1.0f;
         if (other->status != DIST_RAY_HIT) continue;
+        if (other->distance > other->radius)
+            tour->clear[i] = DISTI_MIN(tour->clear[i], (float)((double)disti_foot_least(field, other) * chain->scale));
         double x[3];
         float d[3];
         disti_chain_point(chain, other->best, x);
@@ -11906,7 +12040,8 @@ static void disti_foot_task(void *arg, int index, int worker)
     const float zero[3] = {0.0f, 0.0f, 0.0f};
     disti_bench bench;
     disti_bench_init(job->ctx, worker, &bench);
-    DIST_ASSERT(DISTI_FEET * (2 * sizeof(disti_foot) + 3 * sizeof(float)) <= DISTI_REST_BYTES);
+    DIST_ASSERT(DISTI_FEET * (2 * sizeof(disti_foot) + 3 * sizeof(float)) +
+                DISTI_FOOT_CELLS * sizeof(disti_foot_cell) <= DISTI_REST_BYTES);
     disti_foot *feet = (disti_foot *)(void *)bench.rest, *others = feet + DISTI_FEET;
     float *gradient = (float *)(void *)(others + DISTI_FEET);
     size_t first = (size_t)index * DISTI_FEET, n = DISTI_MIN((size_t)DISTI_FEET, job->n - first), active = 0;
@@ -11935,7 +12070,10 @@ static void disti_foot_task(void *arg, int index, int worker)
         if (job->contacts) {
             dist_contact *contact = &job->contacts[first + i];
             contact->depth = foot->radius - foot->sign * foot->distance;
-            if (foot->status == DIST_RAY_HIT && !(contact->depth > 0.0f)) foot->status = DIST_RAY_MISS;
+            if (foot->status == DIST_RAY_HIT && !(contact->depth > 0.0f)) {
+                contact->depth = foot->radius - disti_foot_least(field, foot);
+                foot->status = DIST_RAY_MISS;
+            }
             if (foot->status == DIST_RAY_NOT_FINITE) contact->depth = 0.0f;
             memcpy(contact->normal, foot->status == DIST_RAY_HIT ? foot->normal : zero, sizeof contact->normal);
             double away[3];

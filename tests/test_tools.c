@@ -466,22 +466,26 @@ static double surface_sample(const dist_field *field, dist_context *ctx, float *
 
 static float surface[3 * RAYS];
 
+/* How far off the nearest surface sample is. */
+static double nearest_of(int count, const float *p)
+{
+    double best = 1e30;
+    for (int j = 0; j < count; j++) {
+        double d = 0;
+        for (int k = 0; k < 3; k++) {
+            double x = (double)p[k] - (double)surface[3 * j + k];
+            d += x * x;
+        }
+        best = fmin(best, d);
+    }
+    return sqrt(best);
+}
+
 /* Share of the points for which a surface sample is nearer than what was found by more than `slack`. */
 static double beaten(int count, double slack)
 {
     int n = 0;
-    for (int i = 0; i < RAYS; i++) {
-        double best = 1e30;
-        for (int j = 0; j < count; j++) {
-            double d = 0;
-            for (int k = 0; k < 3; k++) {
-                double x = (double)points[3 * i + k] - (double)surface[3 * j + k];
-                d += x * x;
-            }
-            best = fmin(best, d);
-        }
-        n += sqrt(best) < fabs((double)distance[i]) - slack;
-    }
+    for (int i = 0; i < RAYS; i++) n += nearest_of(count, points + 3 * i) < fabs((double)distance[i]) - slack;
     return (double)n / RAYS;
 }
 
@@ -590,6 +594,72 @@ static void counted_eval(void *user, int worker, size_t n, const float *at, floa
     field->eval_fn(field->user, worker, n, at, sdf, gradient);
 }
 
+/* Far from the surface a decoder's f is no distance, and its gradient leads to other parts: against the nearest of what
+   rays hit, and spheres that are in by a 50th. Half of the points without the look around, and more, end elsewhere. */
+TEST(what_decoders_say_far_off_leads_to_the_nearest_part_all_the_same)
+{
+    static const struct {
+        const char *name;
+        int code;
+    } nets[] = {{NULL, 37}, {NULL, 111}, {"fox", 0}, {"bob_spot", 1}, {"primitives", 3}, {"chairs", 1}};
+    const float away[3] = {1, 1.5f, 4};
+    dist_context *ctx = test_context();
+    int absent = 0;
+    for (int k = 0; k < (int)(sizeof nets / sizeof *nets); k++) {
+        char path[64];
+        (void)snprintf(path, sizeof path, "nets/%s.safetensors", nets[k].name ? nets[k].name : "");
+        FILE *file = nets[k].name ? fopen(test_data_path(path), "rb") : NULL;
+        absent += nets[k].name && !file;
+        if (nets[k].name && !file) continue;
+        if (file) fclose(file);
+        dist_net *net = dist_net_load_file(ctx, file ? test_data_path(path) : "examples/model.safetensors");
+        dist_shape *shape = dist_shape_create(ctx, net, dist_net_code(net, nets[k].code));
+        dist_field field = dist_shape_field(shape), counted = field;
+        enum { POINTS = 400 };
+        int count;
+        counted.user = &field;
+        counted.eval_fn = counted_eval;
+        surface_sample(&field, ctx, surface, &count);
+        CHECK(count > RAYS / 10);
+        for (int band = 0; band < 3; band++) {
+            test_random random = test_random_seed(131 + (unsigned)(3 * k + band));
+            int off = 0, lost = 0, told = 0;
+            double worst = 0;
+            for (int i = 0; i < POINTS; i++) {
+                test_random_direction(&random, points + 3 * i);
+                for (int axis = 0; axis < 3; axis++)
+                    points[3 * i + axis] = field.center[axis] + away[band] * field.radius * points[3 * i + axis];
+            }
+            asked = 0;
+            dist_field_closest_point(ctx, &counted, POINTS, points, closest, distance, status);
+            double queries = (double)asked / POINTS;
+            for (int i = POINTS; i-- > 0;) { /* spheres, which take the points' place from the end on */
+                double best = nearest_of(count, points + 3 * i), more = fabs((double)distance[i]) - best;
+                lost += status[i] != DIST_RAY_HIT;
+                off += more > 0.01 * (double)field.radius;
+                worst = fmax(worst, more);
+                for (int axis = 3; axis-- > 0;) points[4 * i + axis] = points[3 * i + axis];
+                points[4 * i + 3] = (float)best + 0.02f * field.radius;
+            }
+            CHECK_STATUS(DIST_OK, dist_field_collide(ctx, &field, POINTS, points, contacts), ctx);
+            for (int i = 0; i < POINTS; i++) told += contacts[i].status != DIST_RAY_HIT;
+            CHECK_EQUAL(0, lost);
+            CHECK(off <= 2); /* two parts in one cell may be taken for one */
+            CHECK(told <= 2);
+            CHECK(queries < 180);
+            if (test_state.verbose)
+                printf("    %s %d, %g radii away: %d off by more than a 100th, worst %.3f, %d not found, %d spheres "
+                       "told clear, of %d; %.1f queries a point\n",
+                       nets[k].name ? nets[k].name : "embedded", nets[k].code, (double)away[band], off, worst, lost,
+                       told, POINTS, queries);
+        }
+        dist_shape_destroy(shape);
+        dist_net_destroy(net);
+    }
+    dist_context_destroy(ctx);
+    if (absent) SKIP("there are no test data; the embedded model passes");
+}
+
 /* A torus that is hollow: 0 inside, and flat. */
 static void flat_eval(void *user, int worker, size_t n, const float *at, float *sdf, float *gradient)
 {
@@ -644,7 +714,7 @@ TEST(closest_points_of_smooth_surfaces_take_a_few_queries)
     static const model_desc descs[2] = {
         {.name = "softplus", .code_size = 2, .activation = DIST_ACTIVATION_SOFTPLUS, .first_scale = 4.0},
         {.name = "relu", .code_size = 2, .width = 16, .clamp = 0.3}};
-    static const double most[3] = {7, 12, 60}; /* the shares alone took 17, 60 and 61 */
+    static const double most[3] = {11, 20, 55}; /* the cells of a look around among them */
     dist_context *ctx = shape_context();
     for (int k = 0; k < 3; k++) {
         const float torus[5] = {0, 0, 0, 0.55f, 0.2f};
@@ -713,7 +783,7 @@ TEST(a_nearer_part_of_the_surface_is_found_by_looking_around)
         led += b > 0 && b < a && a / 3 < b;
         past += fabs((double)distance[i]) > fmin(fabs(a), fabs(b)) + 1e-3;
     }
-    CHECK(led > RAYS / 5 && past < 2 * led / 5); /* without all that are led past end there */
+    CHECK(led > RAYS / 5 && past < led / 50); /* without all that are led past end there */
     if (test_state.verbose) printf("    %d are led past the nearer ball, %d end at the other\n", led, past);
     dist_context_destroy(ctx);
 }
@@ -1070,6 +1140,7 @@ int main(int argc, char **argv)
     RUN(fields_far_from_the_origin_are_found_to_within_what_floats_can_tell);
     RUN(closest_points_of_other_fields_are_on_the_surface_and_near);
     RUN(closest_points_of_networks_lie_on_their_surface);
+    RUN(what_decoders_say_far_off_leads_to_the_nearest_part_all_the_same);
     RUN(closest_points_of_fields_without_an_inside_are_found);
     RUN(a_sphere_without_a_radius_is_a_point);
     RUN(closest_points_of_smooth_surfaces_take_a_few_queries);

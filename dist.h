@@ -688,7 +688,7 @@ typedef struct dist_images {
 /* Keeps what the gradient needs: one distance and one status a pixel, and the paper's K samples where asked for. */
 typedef struct dist_tape dist_tape;
 /* For pictures of exactly this camera's size and of this desc's trace and samples.
-   With desc->warm_start the tape also keeps what the next picture can start from (18 bytes a pixel more). A dist_render
+   With desc->warm_start the tape also keeps what the next picture can start from (22 bytes a pixel more). A dist_render
    with warm_start then verifies the last picture's hits and near misses, one query each or none, instead of marching.
    It is meant for an optimization that moves the surface by less than about a pixel a step. Whatever does not
    verify, and every tile in which much has moved, is traced anew; so is the whole picture after a change of camera, of
@@ -13553,6 +13553,7 @@ struct dist_tape {
     /* (pixels), warm start only: slope at a hit, |f| at a miss; where the cones stopped; disti_nearest_task's, and what
        f is not below from there on as far as disti_warm_beside looked, but where a miss's |f| is least */
     float *value, *start, *nearest, *beside;
+    float *owed;            /* (pixels), likewise: by how much a hit may be off that was moved unasked; 0: asked */
     disti_cone *cones;      /* warm start: all of the picture, asked for beside those of other tiles */
     unsigned turn;          /* warm renders so far */
     unsigned *cost;         /* of the last picture's tiles: queries */
@@ -13606,8 +13607,8 @@ static size_t disti_tape_layout(dist_tape *tape, unsigned char *base, int warm)
     tape->status = (unsigned char *)disti_take(base, &at, pixels, 1);
     if (tape->trace == DIST_TRACE_PAPER)
         tape->sample = (float *)disti_take(base, &at, pixels, (size_t)tape->samples * 4 * sizeof(float));
-    float **kept[4] = {&tape->value, &tape->start, &tape->nearest, &tape->beside};
-    for (int i = 0; i < 4 && warm; i++) *kept[i] = (float *)disti_take(base, &at, pixels, sizeof(float));
+    float **kept[5] = {&tape->value, &tape->start, &tape->nearest, &tape->beside, &tape->owed};
+    for (int i = 0; i < 5 && warm; i++) *kept[i] = (float *)disti_take(base, &at, pixels, sizeof(float));
     if (warm) {
         size_t cones = disti_picture_cones(tape->width, tape->height);
         tape->cones = (disti_cone *)disti_take(base, &at, cones, sizeof(disti_cone));
@@ -13645,7 +13646,7 @@ static dist_status disti_tape_take(dist_context *ctx, dist_tape *tape, const dis
     tape->samples = how.samples;
     dist_status status = disti_partial_reserve(ctx, 1024); /* for codes of fields that are not nets */
     if (status != DIST_OK) return status;
-    size_t pixels, all, each = 5 + (how.warm_start ? 20u : 0u) + (how.trace == DIST_TRACE_PAPER ? 128u : 0u);
+    size_t pixels, all, each = 5 + (how.warm_start ? 24u : 0u) + (how.trace == DIST_TRACE_PAPER ? 128u : 0u);
     int fits = disti_size_mul((size_t)tape->width, (size_t)tape->height, &pixels) && disti_size_mul(pixels, each, &all);
     tape->bytes = fits && all < (size_t)-1 / 2 ? disti_tape_layout(tape, NULL, how.warm_start) : (size_t)-1;
     tape->memory = disti_alloc(ctx, tape->bytes);
@@ -13900,7 +13901,7 @@ static void disti_render_pixel(const disti_render_job *job, const disti_ray *ray
                                                     : 0) |
                                                (sampled && !hit && least < 0.0f ? DISTI_TAPE_SOLID : 0));
     if (!job->tape->value) return;
-    if (!ray->kept) job->tape->beside[pixel] = 0.0f;
+    if (!ray->kept) job->tape->beside[pixel] = job->tape->owed[pixel] = 0.0f;
     job->tape->start[pixel] = ray->kept ? DISTI_MIN(job->tape->start[pixel], ray->stop) : ray->stop;
     /* a ray that was looking for the way out has no slope to start from */
     job->tape->value[pixel] = ray->status != DIST_RAY_HIT ? ray->fbest : ray->sign > 0.0f ? ray->slope : 0.0f;
@@ -14216,6 +14217,7 @@ static int disti_warm_newton(disti_warm *warm, int i, float f)
     steep = slope < -0.3f * warm->tracer->lipschitz;
     if (good && length <= (!first ? 12.0f : steep ? 8.0f : 4.0f) * epsilon) {
         disti_warm_hit(warm, i, ray->q, f, disti_newton_error(warm->tracer, epsilon, slope, length, 0));
+        warm->tape->owed[disti_warm_pixel(warm, i)] = 0.0f;
         disti_warm_change(warm, moved * slope);
         return 0;
     }
@@ -14331,9 +14333,13 @@ static void disti_warm_look(disti_warm *warm, int i, int pass)
     /* amid others at a crease; where the picture has hardly moved, those may have mended old errors of theirs */
     float unlike = DISTI_MAX(-3.0f * warm->typical / ray->slope, move < 0.0f ? -move : move);
     float within = ray->slope > -0.45f * warm->tracer->lipschitz ? 32.0f : 8.0f; /* what is flat may move alone */
-    float error = (within - warm->tracer->lipschitz / ray->slope) * epsilon + 2.0f * spread + unlike;
-    if (spread <= 5.0f * epsilon) disti_warm_hit(warm, i, s + move, 0.0f, error);
-    else disti_warm_list(warm, i, DISTI_ASK_NEWTON, s + move);
+    float *owed = &warm->tape->owed[pixel]; /* what it is off by stays until it is asked */
+    if (!(spread <= 5.0f * epsilon)) {
+        disti_warm_list(warm, i, DISTI_ASK_NEWTON, s + move);
+        return;
+    }
+    *owed = DISTI_MAX(*owed, 2.0f * spread + unlike);
+    disti_warm_hit(warm, i, s + move, 0.0f, (within - warm->tracer->lipschitz / ray->slope) * epsilon + *owed);
 }
 
 /* The hits: every 8th (pass 0), the quarter that is asked, the others, which have moved as those around have, or as f
@@ -14647,6 +14653,7 @@ static int disti_warm_near(disti_warm *warm, int i, float f)
     if (more < 0) return disti_warm_again(warm, i);
     ray->kept = 1;
     if (ray->mode != DISTI_WAIT) {
+        warm->tape->owed[disti_warm_pixel(warm, i)] = 0.0f;
         warm->moved[i] = 3e38f;
         warm->bench->depth[i] = disti_hit_depth(ray);
     } else if (ray->moved) {

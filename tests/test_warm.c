@@ -422,6 +422,93 @@ TEST(moved_hits_of_a_fine_epsilon_keep_their_error_bounds)
     CHECK(far * 1000 <= both);
 }
 
+/* A random net of 4 layers of 32 ReLU whose zero set lies in the sphere, f of a mean slope of 1; NULL: it does not. */
+static dist_net *random_net(dist_context *ctx, test_random *random, const float code[8])
+{
+    enum { LAYERS = 4, WIDTH = 32, SAMPLES = 4000 };
+    static float weights[5000], at[3 * SAMPLES], sdf[SAMPLES], gradient[3 * SAMPLES];
+    dist_net_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.layers = LAYERS, desc.width = WIDTH, desc.code_size = 8, desc.code_count = 1;
+    desc.output_linear = 1, desc.bound = 1, desc.clamp = 1000;
+    dist_net *net = dist_net_create(ctx, &desc);
+    size_t count = dist_net_weight_count(net), n = 0;
+    for (int layer = 0; layer <= LAYERS; layer++) {
+        int in = layer > 0 ? WIDTH : 11, out = layer < LAYERS ? WIDTH : 1;
+        double scale = (layer < LAYERS ? 2 : 1) / sqrt(layer > 0 ? WIDTH : 3);
+        for (int k = 0; k < in * out; k++) weights[n++] = (float)(scale * test_random_normal(random));
+        for (int k = 0; k < out; k++) weights[n++] = layer < LAYERS ? (float)(0.5 * test_random_normal(random)) : 0.0f;
+    }
+    CHECK_EQUAL(count, n);
+    double low[2], high[2], slope = 0; /* over the sphere's surface, and in it */
+    dist_net_set_weights(ctx, net, weights);
+    for (int inside = 0; inside < 2; inside++) {
+        dist_shape *shape = dist_shape_create(ctx, net, code);
+        dist_field field = dist_shape_field(shape);
+        for (int i = 0; i < SAMPLES; i++) {
+            float r = inside ? 0.95f * cbrtf(test_random_float(random, 0, 1)) : 0.98f;
+            test_random_direction(random, at + 3 * i);
+            for (int k = 0; k < 3; k++) at[3 * i + k] *= r;
+        }
+        dist_field_eval(ctx, &field, SAMPLES, at, sdf, gradient);
+        low[inside] = 1e30, high[inside] = -1e30;
+        for (int i = 0; i < SAMPLES; i++) {
+            low[inside] = fmin(low[inside], (double)sdf[i]);
+            high[inside] = fmax(high[inside], (double)sdf[i]);
+            const float *g = gradient + 3 * i;
+            slope += inside * (double)disti_length(g[0], g[1], g[2]) / SAMPLES;
+        }
+        dist_shape_destroy(shape);
+    }
+    int flip = high[1] - high[0] > low[0] - low[1];
+    double gap = (flip ? high[1] - high[0] : low[0] - low[1]) / slope;
+    for (int k = 0; k < WIDTH; k++) weights[n - 1 - WIDTH + (size_t)k] *= (float)((flip ? -1 : 1) / slope);
+    weights[n - 1] = (float)((flip ? high[0] : -low[0]) / slope + 0.03 * gap);
+    dist_net_set_weights(ctx, net, weights);
+    if (gap > 0.12) return net;
+    dist_net_destroy(net);
+    return NULL;
+}
+
+/* A hit that was moved as its neighbors were, and not asked since, may be off by as much as it was then: where the code
+   stands still again, too. */
+TEST(hits_that_no_one_has_asked_since_they_moved_keep_their_errors)
+{
+    scene s;
+    int nets = 0, beyond = 0, hits = 0;
+    test_random random = test_random_seed(83);
+    scene_open(&s);
+    while (nets < 12) {
+        float code[8];
+        for (int k = 0; k < 8; k++) code[k] = 0.3f * (float)test_random_normal(&random);
+        dist_net *net = random_net(s.ctx, &random, code);
+        if (!net) continue;
+        dist_shape *shape = dist_shape_create(s.ctx, net, code);
+        nets++;
+        s.field = dist_shape_field(shape);
+        s.how.certified = 0;
+        s.how.lipschitz = 0;
+        render(&s, 1, 0, &warm);
+        for (int k = 0; k < 8; k++) code[k] += 0.0035f * (float)(k % 2 ? 1 : -1);
+        dist_shape_set_code(shape, code);
+        for (int step = 0; step < 3; step++) render(&s, 1, 0, &warm);
+        s.how.certified = 1;
+        s.how.lipschitz = 3 * fmaxf(s.field.certified, s.field.certified_far);
+        render(&s, 0, 0, &cold);
+        for (int i = 0; i < PIXELS; i++) {
+            if (!cold.mask[i] || !warm.mask[i]) continue;
+            hits++;
+            beyond += fabsf(cold.distance[i] - warm.distance[i]) > cold.error[i] + warm.error[i] + 1e-4f;
+        }
+        dist_shape_destroy(shape);
+        dist_net_destroy(net);
+    }
+    CHECK(hits > 50000);
+    CHECK(beyond < hits / 2000);
+    if (test_state.verbose) printf("    of %d hits of %d nets %d are off by more than they say\n", hits, nets, beyond);
+    scene_close(&s);
+}
+
 TEST(a_warm_start_needs_its_tape)
 {
     scene s;
@@ -467,6 +554,7 @@ int main(int argc, char **argv)
     RUN(nets_that_move_by_half_a_thousandth_cost_1_2_queries_a_hit_and_do_not_drift);
     RUN(trained_nets_of_the_test_data_do_not_drift_either);
     RUN(moved_hits_of_a_fine_epsilon_keep_their_error_bounds);
+    RUN(hits_that_no_one_has_asked_since_they_moved_keep_their_errors);
     RUN(a_warm_start_needs_its_tape);
     return test_report();
 }

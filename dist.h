@@ -11613,12 +11613,10 @@ static int disti_foot_told(const dist_field *field, const disti_foot *foot, dist
     double center[3], half = disti_foot_cube(field, foot->cell, center);
     float size = f < 0.0f ? -f : f, lipschitz = field->lipschitz > 0.0f ? field->lipschitz : 1.0f;
     float side = (float)half, step = DISTI_MIN(DISTI_MAX(f / DISTI_MAX(slope, 0.02f * lipschitz), -side), side);
-    int finite = disti_finite(f) && disti_finite(slope), away = 0;
+    int finite = disti_finite(f) && disti_finite(slope), away = !(slope > 1e-6f); /* then there is no way on */
     if (cell->steps++ == 0) cell->empty = finite ? disti_certified_empty(field, size) : 3e38f;
-    for (int i = 0; i < 3 && finite; i++) {
-        cell->seed[i] -= step * n[i];
-        away |= !(fabs((double)cell->seed[i] - center[i]) <= 4.0 * half);
-    }
+    if (finite && !away) disti_foot_move(field, cell->seed, n, -step);
+    for (int i = 0; i < 3; i++) away |= !(fabs((double)cell->seed[i] - center[i]) <= 4.0 * half);
     cell->on = finite && !away && size <= 0.01f * side * DISTI_MAX(slope, 0.25f);
     cell->done = foot->cell < DISTI_FOOT_LEAVES || (double)cell->empty >= 1.7321 * half || cell->on || away ||
                  !finite || cell->steps == DISTI_FOOT_NEWTON;

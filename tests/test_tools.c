@@ -1072,17 +1072,29 @@ static void huge_eval(void *user, int worker, size_t n, const float *p, float *s
     if (gradient) memset(gradient, 0, 3 * n * sizeof(float));
 }
 
+/* A plane that passes beside the sphere. */
+static void beside_eval(void *user, int worker, size_t n, const float *p, float *sdf, float *gradient)
+{
+    float none = 0;
+    (void)user;
+    huge_eval(&none, worker, n, p, sdf, gradient);
+    for (size_t i = 0; i < n; i++) {
+        sdf[i] = p[3 * i] - 1.01f;
+        if (gradient) gradient[3 * i] = 1;
+    }
+}
+
 TEST(no_f_leads_beyond_the_sphere)
 {
     float values[4] = {3e38f, -3e38f, 1e9f, -1e9f}, spheres[8] = {0.3f, 0.2f, 0.1f, 0.5f, 0, 0, 0, 0.1f};
     dist_context *ctx = test_context();
-    for (int k = 0; k < 4; k++) {
+    for (int k = 0; k < 5; k++) {
         dist_field field;
         memset(&field, 0, sizeof field);
-        field.user = &values[k];
-        field.eval_fn = huge_eval;
+        field.user = &values[k % 4];
+        field.eval_fn = k < 4 ? huge_eval : beside_eval;
         field.radius = 1.0f;
-        field.lipschitz = k < 2 ? 0.0f : 1e-30f;
+        field.lipschitz = k < 2 ? 0.0f : k < 4 ? 1e-30f : 1.0f;
         beyond = 0;
         CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &field, 2, spheres, closest, distance, status), ctx);
         CHECK_STATUS(DIST_OK, dist_field_collide(ctx, &field, 2, spheres, contacts), ctx);

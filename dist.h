@@ -11555,17 +11555,19 @@ static float disti_certified_empty(const dist_field *field, float f)
     return f > from ? from / near + (f - from) / disti_certified_far(field) : f / near;
 }
 
+/* From p to x. */
+static double disti_foot_way(const disti_foot *foot, const double x[3])
+{
+    double d[3] = {(double)foot->p[0] - x[0], (double)foot->p[1] - x[1], (double)foot->p[2] - x[2]};
+    return sqrt(disti_dot(d, d));
+}
+
 /* How much nearer to p y is than x, in all the digits that distances from far away lose. */
 static double disti_foot_gain(const disti_foot *foot, const double x[3], const double y[3])
 {
-    double gain = 0.0, from_x = 0.0, from_y = 0.0;
-    for (int i = 0; i < 3; i++) {
-        double p = (double)foot->p[i];
-        gain += (y[i] - x[i]) * (2.0 * p - y[i] - x[i]);
-        from_x += (p - x[i]) * (p - x[i]);
-        from_y += (p - y[i]) * (p - y[i]);
-    }
-    return gain / DISTI_MAX(sqrt(from_x) + sqrt(from_y), 1e-300);
+    double gain = 0.0;
+    for (int i = 0; i < 3; i++) gain += (y[i] - x[i]) * (2.0 * (double)foot->p[i] - y[i] - x[i]);
+    return gain / DISTI_MAX(disti_foot_way(foot, x) + disti_foot_way(foot, y), 1e-300);
 }
 
 /* The center of a cell and half its side. */
@@ -11578,32 +11580,40 @@ static double disti_foot_cube(const dist_field *field, int cell, double center[3
     return radius / scale;
 }
 
-/* The cell after foot->cell: the part of it that is nearest to p, or else the next one that it is a part with. */
-static int disti_foot_next(const dist_field *field, const disti_foot *foot, int inner)
+/* On to the next cell, with its center and half its side: the part of this one that is nearest to p, or else the next
+   one that this one is a part with. */
+static int disti_foot_next(const disti_foot *foot, int inner, double center[3], double *half)
 {
-    double center[3];
-    for (int cell = foot->cell; cell > 0; cell >>= 3, inner = 0) {
-        int corner = 0, nearest = inner ? cell : cell >> 3, turn;
-        (void)disti_foot_cube(field, nearest, center);
+    int cell = foot->cell, part = -1;
+    while (part < 0) {
+        int corner = 0, was = cell & 7;
+        if (!inner && cell <= 1) return 0;
+        for (int i = 0; i < 3 && !inner; i++) center[i] += was >> i & 1 ? -*half : *half;
+        *half *= inner ? 1.0 : 2.0;
+        cell = inner ? cell : cell >> 3;
         for (int i = 0; i < 3; i++) corner |= ((double)foot->p[i] > center[i]) << i;
-        turn = inner ? 0 : ((cell & 7) ^ corner) + 1;
-        if (inner || (turn < 8 && nearest > 0)) return 8 * nearest + (turn ^ corner);
+        part = inner ? corner : (was ^ corner) < 7 ? ((was ^ corner) + 1) ^ corner : -1;
     }
-    return 0;
+    *half *= 0.5;
+    for (int i = 0; i < 3; i++) center[i] += part >> i & 1 ? *half : -*half;
+    return 8 * cell + part;
 }
 
-/* Whether there is something of a cell in the bounding sphere that is nearer than what is hoped for. */
-static int disti_foot_promising(const dist_field *field, const disti_foot *foot, const double from[3])
+/* Whether there is something of a cell in the bounding sphere that is nearer than what is hoped for; as in
+   disti_foot_gain. */
+static int disti_foot_promising(const dist_field *field, const disti_foot *foot, const double from[3],
+                                double from_length, const double center[3], double half)
 {
-    double center[3], half = disti_foot_cube(field, foot->cell, center), to_p[3], out[3];
-    double radius = (double)field->radius;
+    double least = DISTI_MAX(foot->hoped, foot->wanted), radius = (double)field->radius;
+    double gain = 0.0, square = 0.0, out = 0.0;
     for (int i = 0; i < 3; i++) {
-        double low = center[i] - half, high = center[i] + half, c = (double)field->center[i];
-        to_p[i] = DISTI_MIN(DISTI_MAX((double)foot->p[i], low), high);
-        out[i] = DISTI_MIN(DISTI_MAX(c, low), high) - c;
+        double low = center[i] - half, high = center[i] + half, c = (double)field->center[i], p = (double)foot->p[i];
+        double at = DISTI_MIN(DISTI_MAX(p, low), high), inner = DISTI_MIN(DISTI_MAX(c, low), high) - c;
+        gain += (at - from[i]) * (2.0 * p - at - from[i]);
+        square += (p - at) * (p - at);
+        out += inner * inner;
     }
-    if (disti_dot(out, out) >= radius * radius) return 0;
-    return disti_foot_gain(foot, from, to_p) > DISTI_MAX(foot->hoped, foot->wanted);
+    return out < radius * radius && gain > least * (from_length + sqrt(square));
 }
 
 /* A cell's sample f with gradient n * slope at its seed. 1: another one is wanted. */
@@ -11627,15 +11637,12 @@ static int disti_foot_told(const dist_field *field, const disti_foot *foot, dist
 /* Begins a look around from the nearest point so far, or from the center. 0: there was enough of it. */
 static int disti_foot_look_begin(disti_foot_tree *tree, disti_foot *foot, const double from[3])
 {
-    double radius = (double)tree->field->radius, leaf = radius / 16.0, d[3], hope[3];
+    double radius = (double)tree->field->radius, leaf = radius / 16.0, hope[3];
     int lost = foot->status != DIST_RAY_HIT;
     if (foot->looks == DISTI_FOOT_LOOKS || foot->steps + 24 > DISTI_FOOT_STEPS) return 0;
     memcpy(foot->from, foot->x, sizeof foot->from);
-    for (int i = 0; i < 3; i++) {
-        d[i] = (double)foot->p[i] - from[i];
-        hope[i] = (double)foot->hope[i];
-    }
-    double reach = foot->sign > 0.0f ? (double)foot->radius + leaf : 1e300, needed = sqrt(disti_dot(d, d)) - reach;
+    for (int i = 0; i < 3; i++) hope[i] = (double)foot->hope[i];
+    double reach = foot->sign > 0.0f ? (double)foot->radius + leaf : 1e300, needed = disti_foot_way(foot, from) - reach;
     foot->tried = foot->found ? disti_foot_gain(foot, from, hope) : 1e300;
     foot->hoped = lost ? -1e300 : DISTI_MAX(needed, 0.0);
     foot->wanted = lost ? -1e300 : DISTI_MAX(needed, 1e-3 * radius);
@@ -11670,12 +11677,12 @@ static int disti_foot_look(disti_foot_tree *tree, disti_foot *foot)
     const double from[3] = {(double)at[0], (double)at[1], (double)at[2]};
     foot->waits = 0;
     if (foot->cell == 0 && !disti_foot_look_begin(tree, foot, from)) foot->found = 0;
-    for (int inner; foot->cell > 0; foot->cell = disti_foot_next(field, foot, inner)) {
+    double center[3], half = disti_foot_cube(field, foot->cell, center), length = disti_foot_way(foot, from);
+    for (int inner; foot->cell > 0; foot->cell = disti_foot_next(foot, inner, center, &half)) {
         disti_foot_cell *cell = &tree->cells[foot->cell];
-        double center[3], half = disti_foot_cube(field, foot->cell, center);
         double way[3] = {center[0] - from[0], center[1] - from[1], center[2] - from[2]};
         inner = 0;
-        if (!disti_foot_promising(field, foot, from)) continue;
+        if (!disti_foot_promising(field, foot, from, length, center, half)) continue;
         if (foot->cell < DISTI_FOOT_LEAVES && foot->status == DIST_RAY_HIT && disti_dot(way, way) < 3.0 * half * half) {
             inner = 1; /* it is not empty */
             continue;

@@ -595,14 +595,14 @@ static void counted_eval(void *user, int worker, size_t n, const float *at, floa
 }
 
 /* Far from the surface a decoder's f is no distance, and its gradient leads to other parts: against the nearest of what
-   rays hit, and spheres that are in by a 50th. Half of the points without the look around, and more, end elsewhere. */
+   rays hit, and spheres that are in by a 50th. */
 TEST(what_decoders_say_far_off_leads_to_the_nearest_part_all_the_same)
 {
     static const struct {
         const char *name;
         int code;
     } nets[] = {{NULL, 37}, {NULL, 111}, {"fox", 0}, {"bob_spot", 1}, {"primitives", 3}, {"chairs", 1}};
-    const float away[3] = {1, 1.5f, 4};
+    const float away[2] = {1.5f, 4};
     dist_context *ctx = test_context();
     int absent = 0;
     for (int k = 0; k < (int)(sizeof nets / sizeof *nets); k++) {
@@ -621,8 +621,8 @@ TEST(what_decoders_say_far_off_leads_to_the_nearest_part_all_the_same)
         counted.eval_fn = counted_eval;
         surface_sample(&field, ctx, surface, &count);
         CHECK(count > RAYS / 10);
-        for (int band = 0; band < 3; band++) {
-            test_random random = test_random_seed(131 + (unsigned)(3 * k + band));
+        for (int band = 0; band < 2; band++) {
+            test_random random = test_random_seed(131 + (unsigned)(2 * k + band));
             int off = 0, lost = 0, told = 0;
             double worst = 0;
             for (int i = 0; i < POINTS; i++) {

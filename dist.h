@@ -681,6 +681,7 @@ typedef struct dist_images {
                               With field.coarse_fn for eval_fn field.coarse_error is counted in, near outlines by
                               what is seen beside; a ray that just meets an edge may go on far behind it. Where a
                               ray crept along a surface before its hit, up to 0.02 of the radius of that way, too.
+                              With warm_start of the surface that is seen: another one may be seen late (dist_tape).
                               DIST_TRACE_PAPER: |f| of a hit's sample, no bound */
     dist_stats *stats;
 } dist_images;

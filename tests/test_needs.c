@@ -118,7 +118,7 @@ TEST(memory_is_the_tracers_and_the_nets_and_a_tape_only_where_one_is_wanted)
         int planes = needs[i].planes;
         if (planes & TEN) continue;
         size_t cones = disti_round_up(disti_picture_cones(SIZE, SIZE) * sizeof(disti_cone), 64);
-        size_t warm = planes & WARM ? 16 * pixels + cones : 0; /* four planes and the cones */
+        size_t warm = planes & WARM ? 20 * pixels + cones : 0; /* five planes and the cones */
         CHECK_EQUAL(planes & (GRADIENT | WARM) ? tape + warm : none, results[i].bytes);
     }
     CHECK(tape - none < 5 * pixels + 1000000); /* the backward pass's own is the same for every picture */

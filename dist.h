@@ -615,10 +615,10 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
    surface as long as that brings it nearer, then a look around, through the cells of an octree (16 along each side of
    the cube around the bounding sphere) that the figures for how.certified do not show to be empty. Of a distance it is
    as far off as the nearest to within 1e-4 of the radius; of a trained decoder mostly to within a 500th, from far away,
-   too: two parts of the surface in one cell may be taken for one. A point alone asks for 2 to some hundred samples,
-   or more where f tells little of the distance; of a thousand in one call each asks for 10 to 150, as they share the
-   cells, and a cache spares those that it shows to be empty. Of a scene each instance that may be nearest is gone to by
-   itself; what is of one within another is no surface.
+   too: two parts of the surface in one cell may be taken for one. Inside the sphere a distance is asked for 2 samples a
+   point, mostly; a decoder from far away for 40 to 120 a point of some hundred in one call, which share the cells, and
+   for 200 to 2000 of a point alone. A cache spares the cells that it shows to be empty. Of a scene each instance that
+   may be nearest is gone to by itself; what is of one within another is no surface.
    closest (n, 3); distance (n) signed, below 0 inside, and status (n) may be NULL: DIST_RAY_HIT, DIST_RAY_UNRESOLVED
    (no surface found: the last point tried), DIST_RAY_NOT_FINITE. Nothing is asked outside the bounding sphere. */
 DIST_API dist_status dist_field_closest_point(dist_context *ctx, const dist_field *field, size_t n,
@@ -11430,7 +11430,8 @@ typedef struct disti_foot {
     float away;      /* of p from the bounding sphere; 0: within */
     float f, damping, share;
     float rest[3], relax; /* the last slide's, and by which share of it */
-    float from[3], drift[3]; /* of a pull: the nearest point before it, and by how much more it is to go on */
+    float from[3], drift[3]; /* of a pull: the nearest point before it, and by how much more it is to go on; of a
+                                look around: where it set out */
     float sign;
     int cell;        /* of a look around: which is next; 0: none is under way */
     float hope[3];   /* the nearest place that was told of so far */
@@ -11463,21 +11464,32 @@ static float disti_foot_move(const dist_field *field, float *x, const float *n, 
     return DISTI_MAX(length - field->radius, 0.0f);
 }
 
-/* Notes x, which is on the surface with the normal n, if it is the nearest so far, and by how much: of p far away that
-   is less than a float's distances can tell, |p - best| - |p - x| = (x - best) . (2 p - x - best) / (their sum). */
+/* From p to x. */
+static double disti_foot_way(const disti_foot *foot, const double x[3])
+{
+    double d[3] = {(double)foot->p[0] - x[0], (double)foot->p[1] - x[1], (double)foot->p[2] - x[2]};
+    return sqrt(disti_dot(d, d));
+}
+
+/* How much nearer to p y is than x, which is `way` off: of p far away that is less than distances can tell,
+   |p - x| - |p - y| = (y - x) . (2 p - y - x) / (their sum). */
+static double disti_foot_gain(const disti_foot *foot, const double x[3], double way, const double y[3])
+{
+    double gain = 0.0;
+    for (int i = 0; i < 3; i++) gain += (y[i] - x[i]) * (2.0 * (double)foot->p[i] - y[i] - x[i]);
+    return gain / DISTI_MAX(way + disti_foot_way(foot, y), 1e-300);
+}
+
+/* Notes x, which is on the surface with the normal n, if it is the nearest so far. Returns by how much. */
 static float disti_foot_arrive(disti_foot *foot, const float *n)
 {
-    float d[3];
-    double gain = 0.0;
-    for (int i = 0; i < 3; i++) {
-        double x = (double)foot->x[i], best = (double)foot->best[i];
-        d[i] = foot->p[i] - foot->x[i];
-        gain += (x - best) * (2.0 * (double)foot->p[i] - x - best);
-    }
-    float distance = disti_foot_length(d);
-    gain /= DISTI_MAX((double)foot->distance + (double)distance, 1e-300);
-    if (foot->status != DIST_RAY_HIT) gain = (double)(foot->distance - distance); /* the first */
-    if (gain > 0.0 || foot->status != DIST_RAY_HIT) {
+    const double x[3] = {(double)foot->x[0], (double)foot->x[1], (double)foot->x[2]};
+    const double best[3] = {(double)foot->best[0], (double)foot->best[1], (double)foot->best[2]};
+    int first = foot->status != DIST_RAY_HIT;
+    float distance = (float)DISTI_MIN(disti_foot_way(foot, x), 3e38);
+    double gain = (double)(foot->distance - distance);
+    if (!first) gain = disti_foot_gain(foot, best, disti_foot_way(foot, best), x);
+    if (gain > 0.0 || first) {
         memcpy(foot->best, foot->x, sizeof foot->best);
         memcpy(foot->normal, n, sizeof foot->normal);
         foot->distance = distance;
@@ -11556,21 +11568,6 @@ static float disti_certified_empty(const dist_field *field, float f)
     return f > from ? from / near + (f - from) / disti_certified_far(field) : f / near;
 }
 
-/* From p to x. */
-static double disti_foot_way(const disti_foot *foot, const double x[3])
-{
-    double d[3] = {(double)foot->p[0] - x[0], (double)foot->p[1] - x[1], (double)foot->p[2] - x[2]};
-    return sqrt(disti_dot(d, d));
-}
-
-/* How much nearer to p y is than x, in all the digits that distances from far away lose. */
-static double disti_foot_gain(const disti_foot *foot, const double x[3], const double y[3])
-{
-    double gain = 0.0;
-    for (int i = 0; i < 3; i++) gain += (y[i] - x[i]) * (2.0 * (double)foot->p[i] - y[i] - x[i]);
-    return gain / DISTI_MAX(disti_foot_way(foot, x) + disti_foot_way(foot, y), 1e-300);
-}
-
 /* The center of a cell and half its side. */
 static double disti_foot_cube(const dist_field *field, int cell, double center[3])
 {
@@ -11581,40 +11578,46 @@ static double disti_foot_cube(const dist_field *field, int cell, double center[3
     return radius / scale;
 }
 
+/* The part of a cell that is nearest to p. */
+static int disti_foot_corner(const disti_foot *foot, const double center[3])
+{
+    int corner = 0;
+    for (int i = 0; i < 3; i++) corner |= ((double)foot->p[i] > center[i]) << i;
+    return corner;
+}
+
 /* On to the next cell, with its center and half its side: the part of this one that is nearest to p, or else the next
    one that this one is a part with. */
 static int disti_foot_next(const disti_foot *foot, int inner, double center[3], double *half)
 {
-    int cell = foot->cell, part = -1;
-    while (part < 0) {
-        int corner = 0, was = cell & 7;
-        if (!inner && cell <= 1) return 0;
-        for (int i = 0; i < 3 && !inner; i++) center[i] += was >> i & 1 ? -*half : *half;
-        *half *= inner ? 1.0 : 2.0;
-        cell = inner ? cell : cell >> 3;
-        for (int i = 0; i < 3; i++) corner |= ((double)foot->p[i] > center[i]) << i;
-        part = inner ? corner : (was ^ corner) < 7 ? ((was ^ corner) + 1) ^ corner : -1;
+    int cell = foot->cell, turn = inner ? 0 : 8;
+    while (turn == 8) {
+        int was = cell & 7;
+        if (cell <= 1) return 0;
+        for (int i = 0; i < 3; i++) center[i] += was >> i & 1 ? -*half : *half;
+        *half *= 2.0;
+        cell >>= 3;
+        turn = (was ^ disti_foot_corner(foot, center)) + 1;
     }
+    int part = turn ^ disti_foot_corner(foot, center);
     *half *= 0.5;
     for (int i = 0; i < 3; i++) center[i] += part >> i & 1 ? *half : -*half;
     return 8 * cell + part;
 }
 
-/* Whether there is something of a cell in the bounding sphere that is nearer than what is hoped for; as in
-   disti_foot_gain. */
-static int disti_foot_promising(const dist_field *field, const disti_foot *foot, const double from[3],
-                                double from_length, const double center[3], double half)
+/* Whether there is something of a cell in the bounding sphere that is nearer to p than x, `way` off, and what is hoped
+   for. */
+static int disti_foot_promising(const dist_field *field, const disti_foot *foot, const double x[3], double way,
+                                const double center[3], double half)
 {
-    double least = DISTI_MAX(foot->hoped, foot->wanted), radius = (double)field->radius;
-    double gain = 0.0, square = 0.0, out = 0.0;
+    double radius = (double)field->radius, to_p[3], out[3];
     for (int i = 0; i < 3; i++) {
-        double low = center[i] - half, high = center[i] + half, c = (double)field->center[i], p = (double)foot->p[i];
-        double at = DISTI_MIN(DISTI_MAX(p, low), high), inner = DISTI_MIN(DISTI_MAX(c, low), high) - c;
-        gain += (at - from[i]) * (2.0 * p - at - from[i]);
-        square += (p - at) * (p - at);
-        out += inner * inner;
+        double low = center[i] - half, high = center[i] + half, c = (double)field->center[i];
+        to_p[i] = DISTI_MIN(DISTI_MAX((double)foot->p[i], low), high);
+        out[i] = DISTI_MIN(DISTI_MAX(c, low), high) - c;
     }
-    return out < radius * radius && gain > least * (from_length + sqrt(square));
+    if (disti_dot(out, out) >= radius * radius) return 0;
+    return disti_foot_gain(foot, x, way, to_p) > DISTI_MAX(foot->hoped, foot->wanted);
 }
 
 /* A cell's sample f with gradient n * slope at its seed. 1: another one is wanted. */
@@ -11640,11 +11643,12 @@ static int disti_foot_look_begin(disti_foot_tree *tree, disti_foot *foot, const 
 {
     double radius = (double)tree->field->radius, leaf = radius / 16.0, hope[3];
     int lost = foot->status != DIST_RAY_HIT;
-    if (foot->looks == DISTI_FOOT_LOOKS || foot->steps + 24 > DISTI_FOOT_STEPS) return 0;
     memcpy(foot->from, foot->x, sizeof foot->from);
+    if (foot->looks == DISTI_FOOT_LOOKS || foot->steps + 24 > DISTI_FOOT_STEPS) return 0;
     for (int i = 0; i < 3; i++) hope[i] = (double)foot->hope[i];
-    double reach = foot->sign > 0.0f ? (double)foot->radius + leaf : 1e300, needed = disti_foot_way(foot, from) - reach;
-    foot->tried = foot->found ? disti_foot_gain(foot, from, hope) : 1e300;
+    double reach = foot->sign > 0.0f ? (double)foot->radius + leaf : 1e300, way = disti_foot_way(foot, from);
+    double needed = way - reach;
+    foot->tried = foot->found ? disti_foot_gain(foot, from, way, hope) : 1e300;
     foot->hoped = lost ? -1e300 : DISTI_MAX(needed, 0.0);
     foot->wanted = lost ? -1e300 : DISTI_MAX(needed, 1e-3 * radius);
     foot->looks++;
@@ -11657,10 +11661,11 @@ static int disti_foot_look_begin(disti_foot_tree *tree, disti_foot *foot, const 
 }
 
 /* Notes the seed of a leaf if it is the nearest, but for those at what is nearest already or has been tried. */
-static void disti_foot_note(const dist_field *field, disti_foot *foot, const double from[3], const float *seed)
+static void disti_foot_note(const dist_field *field, disti_foot *foot, const double from[3], double way,
+                            const float *seed)
 {
     const double at[3] = {(double)seed[0], (double)seed[1], (double)seed[2]};
-    double gain = disti_foot_gain(foot, from, at), apart = 0.0;
+    double gain = disti_foot_gain(foot, from, way, at), apart = 0.0;
     for (int i = 0; i < 3; i++) apart = DISTI_MAX(apart, fabs(at[i] - from[i]));
     if (!(gain > foot->hoped && gain < foot->tried)) return;
     if (gain < foot->wanted && apart < 0.1 * (double)field->radius) return;
@@ -11678,13 +11683,13 @@ static int disti_foot_look(disti_foot_tree *tree, disti_foot *foot)
     const double from[3] = {(double)at[0], (double)at[1], (double)at[2]};
     foot->waits = 0;
     if (foot->cell == 0 && !disti_foot_look_begin(tree, foot, from)) foot->found = 0;
-    double center[3], half = disti_foot_cube(field, foot->cell, center), length = disti_foot_way(foot, from);
+    double center[3], half = disti_foot_cube(field, foot->cell, center), way = disti_foot_way(foot, from);
     for (int inner; foot->cell > 0; foot->cell = disti_foot_next(foot, inner, center, &half)) {
         disti_foot_cell *cell = &tree->cells[foot->cell];
-        double way[3] = {center[0] - from[0], center[1] - from[1], center[2] - from[2]};
+        double d[3] = {center[0] - from[0], center[1] - from[1], center[2] - from[2]};
         inner = 0;
-        if (!disti_foot_promising(field, foot, from, length, center, half)) continue;
-        if (foot->cell < DISTI_FOOT_LEAVES && foot->status == DIST_RAY_HIT && disti_dot(way, way) < 3.0 * half * half) {
+        if (!disti_foot_promising(field, foot, from, way, center, half)) continue;
+        if (foot->cell < DISTI_FOOT_LEAVES && foot->status == DIST_RAY_HIT && disti_dot(d, d) < 3.0 * half * half) {
             inner = 1; /* it is not empty */
             continue;
         }
@@ -11702,7 +11707,7 @@ static int disti_foot_look(disti_foot_tree *tree, disti_foot *foot)
         }
         if ((double)cell->empty >= 1.7321 * half) continue;
         inner = foot->cell < DISTI_FOOT_LEAVES;
-        if (cell->on) disti_foot_note(field, foot, from, cell->seed);
+        if (cell->on) disti_foot_note(field, foot, from, way, cell->seed);
     }
     foot->begun = foot->steps;
     if (!foot->found && foot->status == DIST_RAY_HIT)

@@ -2681,7 +2681,6 @@ DISTI_PLAIN(scalar, static)
      DISTI_FMA(c, a, b)                 c += a b, in place: from intrinsics gcc makes copies and runs out of registers
      DISTI_RELU(v) DISTI_POSITIVE(v)    max(v, 0), and the bits of the lanes that are greater than 0: NaN stays and is
                                         greater (of two numbers of which one is NaN, x86's max is the second)
-     DISTI_BITS(row, column, v)         the latter into a mask's row, from this column on
      DISTI_KEEP(v, bits)                v with 0 where the lane's bit is 0
      DISTI_TALL(isa)                    tiles of one vector's columns, where there are registers for sixteen rows
      DISTI_FEW(isa)                     the reverse pass of up to four rows, where other tiles are higher
@@ -2737,7 +2736,7 @@ DISTI_PLAIN(scalar, static)
 
 #define DISTI_STORE_RELU1(i, j)                                                                                        \
     a##i##j = DISTI_ADD(a##i##j, b);                                                                                   \
-    DISTI_BITS(mask + i, c + j * DISTI_LANES, a##i##j)                                                                 \
+    bits |= (uint64_t)DISTI_POSITIVE(a##i##j) << (j * DISTI_LANES);                                                    \
     DISTI_STORE(y + i * DISTI_BLOCK + j * DISTI_LANES, DISTI_RELU(a##i##j));
 #define DISTI_STORE_POSITIVE1(i, j) \
     DISTI_STORE(y + i * DISTI_BLOCK + j * DISTI_LANES, DISTI_RELU(DISTI_ADD(a##i##j, b)));
@@ -2747,7 +2746,13 @@ DISTI_PLAIN(scalar, static)
 #define DISTI_STORE_PART1(i, j) DISTI_STORE(y + i * DISTI_BLOCK + j * DISTI_LANES, a##i##j);
 #define DISTI_STORE_PART(i, V) DISTI_X##V(DISTI_STORE_PART1, i)
 #define DISTI_STORE_SUM(i, V) { const DISTI_VEC b = DISTI_SET1(bias[i]); DISTI_X##V(DISTI_STORE_SUM1, i) }
-#define DISTI_STORE_RELU(i, V) { const DISTI_VEC b = DISTI_SET1(bias[i]); DISTI_X##V(DISTI_STORE_RELU1, i) }
+#define DISTI_STORE_RELU(i, V)                                                                                         \
+    {                                                                                                                  \
+        const DISTI_VEC b = DISTI_SET1(bias[i]);                                                                       \
+        uint64_t bits = 0;                                                                                             \
+        DISTI_X##V(DISTI_STORE_RELU1, i)                                                                               \
+        mask[i] |= bits << c;                                                                                          \
+    }
 #define DISTI_STORE_POSITIVE(i, V) { const DISTI_VEC b = DISTI_SET1(bias[i]); DISTI_X##V(DISTI_STORE_POSITIVE1, i) }
 
 /* Takes inputs from..to-1 of the list or of all; between two passes over DISTI_DEPTH rows the sums wait in y.
@@ -2808,14 +2813,15 @@ DISTI_PLAIN(scalar, static)
 #define DISTI_PLACE(i, V) const size_t k##i = (size_t)(unsigned)(o[i] >> 3) * panel + (size_t)(unsigned)(o[i] & 7);
 #define DISTI_SOME_STORE1(i, j)                                                                                        \
     a##i##j = DISTI_ADD(a##i##j, b);                                                                                   \
-    DISTI_BITS(mask, c + j * DISTI_LANES, a##i##j)                                                                     \
+    bits |= (uint64_t)DISTI_POSITIVE(a##i##j) << (j * DISTI_LANES);                                                    \
     DISTI_STORE(y + j * DISTI_LANES, DISTI_RELU(a##i##j));
 #define DISTI_SOME_STORE(i, V)                                                                                         \
     if (i < count) {                                                                                                   \
         const DISTI_VEC b = DISTI_SET1(g->bias[o[i]]);                                                                 \
-        uint64_t *mask = g->mask + o[i];                                                                               \
+        uint64_t bits = 0;                                                                                             \
         float *y = g->y + (size_t)(unsigned)o[i] * DISTI_BLOCK + c;                                                    \
         DISTI_X##V(DISTI_SOME_STORE1, i)                                                                               \
+        g->mask[o[i]] |= bits << c;                                                                                    \
     }
 #define DISTI_SOME_TILE(name, R, V)                                                                                    \
     DISTI_NOINLINE DISTI_FUNCTION void disti_some_##name(const disti_gemm *g, const int *o, int count, int c)          \
@@ -2929,12 +2935,13 @@ DISTI_PLAIN(scalar, static)
     DISTI_FUNCTION void disti_relu_##isa(size_t rows, float *y, uint64_t *mask)                                        \
     {                                                                                                                  \
         for (size_t u = 0; u < rows; u++, y += DISTI_BLOCK, mask++) {                                                  \
-            *mask = 0;                                                                                                 \
+            uint64_t bits = 0;                                                                                         \
             for (int c = 0; c < DISTI_BLOCK; c += DISTI_LANES) {                                                       \
                 const DISTI_VEC v = DISTI_LOAD(y + c);                                                                 \
-                DISTI_BITS(mask, c, v)                                                                                 \
+                bits |= (uint64_t)DISTI_POSITIVE(v) << c;                                                              \
                 DISTI_STORE(y + c, DISTI_RELU(v));                                                                     \
             }                                                                                                          \
+            *mask = bits;                                                                                              \
         }                                                                                                              \
     }
 #define DISTI_OUTER1(i, j)                                                                                             \
@@ -2943,6 +2950,7 @@ DISTI_PLAIN(scalar, static)
         DISTI_FMA(product, b, x##j);                                                                                   \
         DISTI_STORE(to + j * DISTI_LANES, DISTI_KEEP(product, bits >> (j * DISTI_LANES)));                             \
     }
+#define DISTI_LANES1(i, j) { const DISTI_VEC b = DISTI_LOAD(x + j * DISTI_LANES); DISTI_FMA(a, b, x##j); }
 #define DISTI_LAST_LAYER(isa)                                                                                          \
     DISTI_FUNCTION void disti_dot_##isa(                                                                               \
         const float *w, float bias_value, const float *matrix, const int *alive, int alive_count, int rows,            \
@@ -2982,18 +2990,29 @@ DISTI_PLAIN(scalar, static)
         const float *s, const float *matrix, const int *alive, int alive_count, int rows, int columns, float *sum)     \
     {                                                                                                                  \
         const int count = alive ? alive_count : rows;                                                                  \
-        for (int n = 0; n < count; n++) {                                                                              \
+        int c = 0;                                                                                                     \
+        for (; c + 3 * DISTI_LANES <= columns; c += 3 * DISTI_LANES) {                                                 \
+            const float *const xs = s + c;                                                                             \
+            DISTI_X3(DISTI_INPUT, 0)                                                                                   \
+            for (int n = 0; n < count; n++) {                                                                          \
+                const size_t k = (size_t)(unsigned)(alive ? alive[n] : n);                                             \
+                const float *x = matrix + k * DISTI_BLOCK + c;                                                         \
+                DISTI_VEC a = DISTI_LOAD(sum + k * 16);                                                                \
+                DISTI_X3(DISTI_LANES1, 0)                                                                              \
+                DISTI_STORE(sum + k * 16, a);                                                                          \
+            }                                                                                                          \
+        }                                                                                                              \
+        for (int n = 0; n < count && c < columns; n++) {                                                               \
             const size_t k = (size_t)(unsigned)(alive ? alive[n] : n);                                                 \
             const float *x = matrix + k * DISTI_BLOCK;                                                                 \
-            float *to = sum + k * 16;                                                                                  \
-            DISTI_VEC a = DISTI_LOAD(to);                                                                              \
-            int c = 0;                                                                                                 \
-            for (; c + DISTI_LANES <= columns; c += DISTI_LANES) {                                                     \
-                const DISTI_VEC b = DISTI_LOAD(s + c), x0 = DISTI_LOAD(x + c);                                         \
+            DISTI_VEC a = DISTI_LOAD(sum + k * 16);                                                                    \
+            int i = c;                                                                                                 \
+            for (; i + DISTI_LANES <= columns; i += DISTI_LANES) {                                                     \
+                const DISTI_VEC b = DISTI_LOAD(s + i), x0 = DISTI_LOAD(x + i);                                         \
                 DISTI_FMA(a, b, x0);                                                                                   \
             }                                                                                                          \
-            DISTI_STORE(to, a);                                                                                        \
-            for (; c < columns; c++) to[0] += s[c] * x[c];                                                             \
+            DISTI_STORE(sum + k * 16, a);                                                                              \
+            for (; i < columns; i++) sum[k * 16] += s[i] * x[i];                                                       \
         }                                                                                                              \
     }
 
@@ -3244,7 +3263,6 @@ static const int *disti_back_rows(const disti_gemm_back *g, int rows, int n, int
 #define DISTI_FMA(c, a, b) c = _mm_add_ps(_mm_mul_ps(a, b), c)
 #define DISTI_RELU(v) _mm_max_ps(_mm_setzero_ps(), v)
 #define DISTI_POSITIVE(v) (unsigned)_mm_movemask_ps(_mm_cmpnle_ps(v, _mm_setzero_ps()))
-#define DISTI_BITS(row, column, v) *(row) |= (uint64_t)DISTI_POSITIVE(v) << (column);
 #define DISTI_KEEP(v, bits) disti_keep_sse2(v, (int)((bits) & 0xf))
 DISTI_FUNCTION __m128 disti_keep_sse2(__m128 v, int bits)
 {
@@ -3279,7 +3297,6 @@ DISTI_FEW_TILE(four_sse2, 4, 2)
 #undef DISTI_FMA
 #undef DISTI_RELU
 #undef DISTI_POSITIVE
-#undef DISTI_BITS
 #undef DISTI_KEEP
 
 #define DISTI_FUNCTION DISTI_TARGET("avx2,fma") DISTI_KERNEL static
@@ -3296,7 +3313,6 @@ DISTI_FEW_TILE(four_sse2, 4, 2)
 #endif
 #define DISTI_RELU(v) _mm256_max_ps(_mm256_setzero_ps(), v)
 #define DISTI_POSITIVE(v) (unsigned)_mm256_movemask_ps(_mm256_cmp_ps(v, _mm256_setzero_ps(), _CMP_NLE_UQ))
-#define DISTI_BITS(row, column, v) ((unsigned char *)(row))[(column) / 8] = (unsigned char)DISTI_POSITIVE(v);
 #define DISTI_KEEP(v, bits) disti_keep_avx2(v, (int)((bits) & 0xff))
 DISTI_FUNCTION __m256 disti_keep_avx2(__m256 v, int bits)
 {
@@ -3344,7 +3360,6 @@ static const disti_part disti_parts_avx2[] = {{9, 18, 6}, {25, 30, 24}, {33, 40,
 #undef DISTI_FMA
 #undef DISTI_RELU
 #undef DISTI_POSITIVE
-#undef DISTI_BITS
 #undef DISTI_KEEP
 
 #define DISTI_FUNCTION DISTI_TARGET("avx512f,avx512bw,avx512dq,avx512vl,fma") DISTI_KERNEL static
@@ -3362,8 +3377,6 @@ static const disti_part disti_parts_avx2[] = {{9, 18, 6}, {25, 30, 24}, {33, 40,
 /* Unmasked, gcc 12 warns in C++ that its own header uses an uninitialized variable. */
 #define DISTI_RELU(v) _mm512_maskz_max_ps((__mmask16)0xffff, _mm512_setzero_ps(), v)
 #define DISTI_POSITIVE(v) _mm512_cmp_ps_mask(v, _mm512_setzero_ps(), _CMP_NLE_UQ)
-#define DISTI_BITS(row, column, v) \
-    { const __mmask16 m = DISTI_POSITIVE(v); memcpy((char *)(row) + (column) / 8, &m, sizeof m); }
 #define DISTI_KEEP(v, bits) _mm512_maskz_mov_ps((__mmask16)((bits) & 0xffff), v)
 #define DISTI_DEPTH 512
 /* Eight sums are too few to hide the latency of a multiply-add. */
@@ -3682,7 +3695,6 @@ DISTI_HALF_KERNEL(bf16)
 #define DISTI_FMA(c, a, b) c = vfmaq_f32(c, a, b)
 #define DISTI_RELU(v) disti_positive_part(v)
 #define DISTI_POSITIVE(v) disti_positive_neon(v)
-#define DISTI_BITS(row, column, v) *(row) |= (uint64_t)DISTI_POSITIVE(v) << (column);
 #define DISTI_KEEP(v, bits) disti_keep_neon(v, (uint32_t)((bits) & 0xf))
 static float32x4_t disti_positive_part(float32x4_t v)
 {
@@ -3845,6 +3857,7 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_FETCH
 #undef DISTI_WEIGHTS_TILE
 #undef DISTI_OUTER1
+#undef DISTI_LANES1
 #undef DISTI_RELU_ROWS
 #undef DISTI_PLAIN
 #undef DISTI_LAST_LAYER
@@ -3884,7 +3897,6 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_FMA
 #undef DISTI_RELU
 #undef DISTI_POSITIVE
-#undef DISTI_BITS
 #undef DISTI_KEEP
 #undef DISTI_TALL
 #undef DISTI_FEW
@@ -4462,6 +4474,18 @@ typedef struct disti_backward_piece {
     size_t first;
 } disti_backward_piece;
 
+/* d += s g, of three numbers each. */
+DISTI_LOOPS static void disti_add_scaled(size_t n, const float *DISTI_RESTRICT s, const float *DISTI_RESTRICT g,
+                                         float *DISTI_RESTRICT d)
+{
+    for (; n >= 4; n -= 4, s += 4, g += 12, d += 12) {
+        float each[12];
+        for (int i = 0; i < 12; i++) each[i] = s[i / 3];
+        for (int i = 0; i < 12; i++) d[i] += each[i] * g[i];
+    }
+    for (size_t i = 0; i < 3 * n; i++) d[i] += s[i / 3] * g[i];
+}
+
 static void disti_backward_seed(void *user, size_t first, size_t count, const float *sdf, const float *gradient,
                                 float *d_sdf)
 {
@@ -4473,13 +4497,14 @@ static void disti_backward_seed(void *user, size_t first, size_t count, const fl
     if (job->seed_fn && job->d_sdf) memcpy(job->d_sdf + at, d_sdf, count * sizeof(float));
     if (!job->d_points || !gradient) return;
     const float *p = job->points + 3 * at;
-    int all = disti_finite_all(count, d_sdf) && disti_finite_all(3 * count, gradient) && disti_finite_all(3 * count, p);
-    for (float *d = job->d_points + 3 * at; count > 0; count--, d += 3, gradient += 3, p += 3, d_sdf++) {
-        if (!all && !(disti_finite(*d_sdf) && disti_finite_all(3, gradient) && disti_finite_all(3, p))) continue;
-        d[0] += *d_sdf * gradient[0];
-        d[1] += *d_sdf * gradient[1];
-        d[2] += *d_sdf * gradient[2];
+    float *d = job->d_points + 3 * at;
+    if (disti_finite_all(count, d_sdf) && disti_finite_all(3 * count, gradient) && disti_finite_all(3 * count, p)) {
+        disti_add_scaled(count, d_sdf, gradient, d);
+        return;
     }
+    for (size_t i = 0; i < count; i++)
+        if (disti_finite(d_sdf[i]) && disti_finite_all(3, gradient + 3 * i) && disti_finite_all(3, p + 3 * i))
+            disti_add_scaled(1, d_sdf + i, gradient + 3 * i, d + 3 * i);
 }
 
 static void disti_backward_task(void *arg, int index, int worker)
@@ -7052,16 +7077,18 @@ static void disti_fold_sum(const dist_shape *shape, disti_block *b, const float 
     if (index % 16 == 15) disti_fold_flush(net, b);
 }
 
-/* Points that are not finite, or with a seed that is not (n, each), add nothing to the code: 0 times NaN would. */
-static void disti_fold_drop(const dist_shape *shape, const disti_block *b, size_t n, const float *points, size_t each,
-                            const float *seed)
+/* Points that are not finite, or with a seed that is not (n, each), add nothing to the code: 0 times NaN would. Returns
+   whether there are any. */
+static int disti_fold_drop(const dist_shape *shape, const disti_block *b, size_t n, const float *points, size_t each,
+                           const float *seed)
 {
     size_t rows = (size_t)shape->net->fold_count * (size_t)shape->net->max_rows;
-    if (disti_finite_all(3 * n, points) && disti_finite_all(each * n, seed)) return;
+    if (disti_finite_all(3 * n, points) && disti_finite_all(each * n, seed)) return 0;
     for (size_t c = 0; c < n; c++) {
         if (disti_finite_all(3, points + 3 * c) && disti_finite_all(each, seed + each * c)) continue;
         for (size_t row = 0; row < rows; row++) b->fold_delta[row * DISTI_BLOCK + c] = 0.0f;
     }
+    return 1;
 }
 
 /* Whether few points go through kernels.few. */
@@ -7413,8 +7440,8 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
         if (!seed_fn) continue;
         seed_fn(seed_user, at, count, block->value, own.pull, own.seed);
         if (!d_code) continue;
-        disti_fold_drop(shape, block, count, points + 3 * at, 1, own.seed);
-        for (size_t c = 0; c < count; c++) own.seed[c] = disti_finite(own.seed[c]) ? own.seed[c] : 0.0f;
+        int dropped = disti_fold_drop(shape, block, count, points + 3 * at, 1, own.seed);
+        for (size_t c = 0; dropped && c < count; c++) own.seed[c] = disti_finite(own.seed[c]) ? own.seed[c] : 0.0f;
         disti_fold_sum(shape, block, own.seed, at / DISTI_BLOCK);
     }
     if (d_code) disti_fold_backward(shape, &own, 0, (size_t)net->code_size, d_code);

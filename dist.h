@@ -509,8 +509,8 @@ enum { DIST_PAPER_COARSE_TO_FINE = 0, DIST_PAPER_AGGRESSIVE, DIST_PAPER_DYNAMIC,
 enum { DIST_GRADIENT_AUTO = 0, DIST_GRADIENT_IMPLICIT, DIST_GRADIENT_NORMAL, DIST_GRADIENT_PAPER };
 enum { DIST_NORMAL_ANALYTIC = 0, DIST_NORMAL_DIFFERENCE = 1 };
 enum { DIST_SPACE_CAMERA = 0, DIST_SPACE_WORLD = 1 };
-/* Of a ray that starts in the solid: no hit; a hit at its start; where it leaves the solid (with DIST_TRACE_PAPER: no
-   hit). */
+/* Of a ray that starts in the solid, DIST_RAY_INSIDE: no hit; a hit at its start, without pull on the shape; or
+   DIST_RAY_HIT where it leaves the solid, with gradients as any (with DIST_TRACE_PAPER: no hit). */
 enum { DIST_INSIDE_BACKGROUND = 0, DIST_INSIDE_HIT = 1, DIST_INSIDE_EXIT = 2 };
 
 enum {
@@ -518,7 +518,7 @@ enum {
     DIST_RAY_HIT,        /* the distance is within its error bound, see dist_images.error */
     DIST_RAY_UNRESOLVED, /* budget spent: mask 0, distance of the sample of smallest |f|, or where neighbors or cones
                             say; a surface, if there is one, is no farther from there than the error */
-    DIST_RAY_INSIDE,     /* started inside the solid: as how.inside says */
+    DIST_RAY_INSIDE,     /* started inside the solid, but for those of DIST_INSIDE_EXIT that leave it */
     DIST_RAY_PLATEAU,    /* f is small and flat: no crossing within reach; mask 0 */
     DIST_RAY_NOT_FINITE, /* the field gave NaN or infinity: mask 0 */
     DIST_RAY_SKIPPED     /* not asked for (how.pixels): mask 0, silhouette 0, no query, no gradient */
@@ -868,7 +868,8 @@ DIST_API void dist_pfm_free(dist_context *ctx, float *pixels, int width, int hei
 
 #ifndef DIST_NO_MESH
 /* Mesh files in memory. read: PLY (ascii, binary little-endian; triangles and polygons), OBJ (v, f; polygons
-   fanned), OFF; told apart by their first bytes; normals are left out. write: PLY binary, or OBJ. */
+   fanned), OFF; told apart by their first bytes; normals and faces of fewer than three corners are left out. write:
+   PLY binary, or OBJ. */
 enum { DIST_MESH_PLY = 0, DIST_MESH_OBJ = 1 };
 DIST_API dist_mesh *dist_mesh_read(dist_context *ctx, const void *bytes, size_t size);
 DIST_API dist_status dist_mesh_write(dist_context *ctx, const dist_mesh *mesh, int format, void *buffer,
@@ -16342,13 +16343,13 @@ static int disti_mesh_whole(dist_context *ctx, const char *name, const dist_mesh
     return disti_mesh_arrays(ctx, name, mesh->vertex_count, mesh->vertices, mesh->triangle_count, mesh->triangles);
 }
 
-/* 0 after disti_fail if a triangle has a vertex that is not there. */
+/* 0 after disti_fail if a triangle has a vertex that is not there. first: what the sentence calls vertex 0. */
 static int disti_mesh_check(dist_context *ctx, const dist_mesh *mesh, dist_status status, const char *format,
-                            const char *text)
+                            const char *text, int first)
 {
     for (size_t i = 0; i < 3 * mesh->triangle_count; i++) {
         if (mesh->triangles[i] < mesh->vertex_count) continue;
-        disti_fail(ctx, status, format, text, (double)mesh->triangles[i], (double)mesh->vertex_count);
+        disti_fail(ctx, status, format, text, (double)mesh->triangles[i] + first, (double)mesh->vertex_count);
         return 0;
     }
     return 1;
@@ -16374,7 +16375,7 @@ DIST_API dist_mesh *dist_mesh_create(dist_context *ctx, size_t vertex_count, con
     for (size_t i = 0; good && i < triangle_count; i++)
         good = disti_mesh_add_triangle(mesh, triangles[3 * i], triangles[3 * i + 1], triangles[3 * i + 2]);
     const char *format = "dist_mesh_create: a triangle has vertex %d, must be below %d";
-    if (good && disti_mesh_check(ctx, mesh, DIST_BAD_ARGUMENT, format, NULL)) return mesh;
+    if (good && disti_mesh_check(ctx, mesh, DIST_BAD_ARGUMENT, format, NULL, 0)) return mesh;
     dist_mesh_destroy(mesh);
     return NULL;
 }
@@ -16859,7 +16860,7 @@ DIST_API dist_status dist_mesh_sample(dist_context *ctx, const dist_mesh *mesh, 
     if (!mesh || (n && !points)) return disti_refuse(ctx, "dist_mesh_sample: %s is NULL", mesh ? "points" : "mesh");
     if (count == 0) return disti_refuse(ctx, "%s: the mesh has no triangles", name);
     if (!disti_mesh_whole(ctx, name, mesh)) return DIST_BAD_ARGUMENT;
-    if (!disti_mesh_check(ctx, mesh, DIST_BAD_ARGUMENT, "%s: a triangle has vertex %d, must be below %d", name))
+    if (!disti_mesh_check(ctx, mesh, DIST_BAD_ARGUMENT, "%s: a triangle has vertex %d, must be below %d", name, 0))
         return DIST_BAD_ARGUMENT;
     disti_size_mul(count, sizeof(double), &bytes);
     double *until = (double *)disti_alloc(ctx, bytes); /* area of the triangles up to and with this one */
@@ -17388,6 +17389,16 @@ static int disti_mesh_read_corner(disti_mesh_text *r, size_t k, double index)
     return 1;
 }
 
+/* A line of OBJ goes on after a backslash at its end. */
+static void disti_skip_blank_obj(disti_text *t)
+{
+    disti_skip_blank(t);
+    while (t->end - t->at > 1 && t->at[0] == '\\' && disti_is_line_end(t->at[1])) {
+        disti_skip_line(t);
+        disti_skip_blank(t);
+    }
+}
+
 /* Without vertices: what disti_write_obj makes of an empty mesh, a comment and nothing else. */
 static int disti_read_obj(disti_mesh_text *r)
 {
@@ -17401,18 +17412,22 @@ static int disti_read_obj(disti_mesh_text *r)
         int face = *t->at++ == 'f';
         double v[3];
         for (int k = 0; !face && k < 3; k++) {
-            disti_skip_blank(t);
+            disti_skip_blank_obj(t);
             if (!disti_text_number(t, v + k))
                 return disti_mesh_fail(r, DIST_BAD_FILE, "a vertex must be three numbers", 0);
         }
         if (!face && !disti_mesh_read_vertex(r, v)) return 0;
         for (size_t k = 0; face; k++) {
             int64_t i = 0;
-            disti_skip_blank(t);
+            disti_skip_blank_obj(t);
             if (t->at == t->end || disti_is_line_end(*t->at) || *t->at == '#') break;
-            if (!disti_text_integer(t, &i) || i == 0 || (t->at < t->end && *t->at != '/' && !disti_is_space(*t->at)))
+            if (!disti_text_integer(t, &i) ||
+                (t->at < t->end && *t->at != '/' && *t->at != '\\' && !disti_is_space(*t->at)))
                 return disti_mesh_fail(r, DIST_BAD_FILE, "not a corner of a face", 0);
-            while (t->at < t->end && !disti_is_space(*t->at)) t->at++; /* texture and normal */
+            if (i == 0 || i + (int64_t)r->mesh->vertex_count < 0)
+                return disti_mesh_fail(r, DIST_BAD_FILE, "a face has vertex %d, must count from 1, or back from -1 to "
+                                                         "what stands before it", (double)i);
+            while (t->at < t->end && *t->at != '\\' && !disti_is_space(*t->at)) t->at++; /* texture and normal */
             if (!disti_mesh_read_corner(r, k, (double)(i > 0 ? i - 1 : i + (int64_t)r->mesh->vertex_count))) return 0;
         }
     }
@@ -17648,7 +17663,7 @@ static dist_mesh *disti_mesh_parse(dist_context *ctx, const char *label, const v
     r.label = label;
     r.mesh = disti_mesh_new(ctx);
     if (!r.mesh) return NULL;
-    int good;
+    int good, obj = 0;
     if (size > 3 && memcmp(bytes, "\357\273\277", 3) == 0) r.text.at += 3; /* some editors mark UTF-8 so */
     const char *text = r.text.at;
     size = (size_t)(r.text.end - text);
@@ -17663,10 +17678,12 @@ static dist_mesh *disti_mesh_parse(dist_context *ctx, const char *label, const v
             off = disti_is_space(next) || (next >= '0' && next <= '9');
         }
         if (off) r.text.at += prefix + 3;
+        obj = !off;
         good = off ? disti_read_off(&r) : disti_read_obj(&r);
     }
-    const char *format = "dist_mesh_read (%s): a face has vertex %d, must be below %d";
-    if (good && disti_mesh_check(ctx, r.mesh, DIST_BAD_FILE, format, label)) return r.mesh;
+    const char *format = obj ? "dist_mesh_read (%s): a face has vertex %d, must be 1 to %d"
+                             : "dist_mesh_read (%s): a face has vertex %d, must be below %d";
+    if (good && disti_mesh_check(ctx, r.mesh, DIST_BAD_FILE, format, label, obj)) return r.mesh;
     dist_mesh_destroy(r.mesh);
     return NULL;
 }
@@ -17755,7 +17772,7 @@ DIST_API dist_status dist_mesh_write(dist_context *ctx, const dist_mesh *mesh, i
         if (!disti_finite_all(3, mesh->vertices + 3 * i) ||
             (mesh->normals && !disti_finite_all(3, mesh->normals + 3 * i)))
             return disti_fail(ctx, DIST_NOT_FINITE, "%s: vertex %d is not finite", name, (double)i, 0);
-    if (!disti_mesh_check(ctx, mesh, DIST_BAD_ARGUMENT, "%s: a triangle has vertex %d, must be below %d", name))
+    if (!disti_mesh_check(ctx, mesh, DIST_BAD_ARGUMENT, "%s: a triangle has vertex %d, must be below %d", name, 0))
         return DIST_BAD_ARGUMENT;
     for (int pass = 0; pass < 2; pass++) { /* counts, then writes */
         if (format == DIST_MESH_PLY) disti_write_ply(&sink, mesh);

@@ -287,6 +287,7 @@ static const char *const good_files[] = {
     "# obj\nmtllib a.mtl\nv 0 0 0\nv 1. 0 0 1.0\nvt 0 0\nvn 0 0 1\nv 1 1e0 -0.0\nv .0 +1 0\nusemtl a\nf 1/1/1 2//1 3/1 "
     "4\n",
     "v 0 0 0\nv 1 0 0\nv 1 1 0\nf -3 -2 -1 4\nv 0 1 0",
+    "v 0 0 \\\n0\nv 1 0 0\nv \\\r\n1 1\\\n 0\nv 0 1 0\nf 1 2/2\\\n 3 \\\r\\\r4\\\n\n",
     "f 1 2 3\nf 1 3 4\nf 1 2\nf\n  v 0 0 0\n\tv\t1\t0\t0\r\nv 1 1 0 0.5 0.5 0.5\nv 0 1 0 # end\n"};
 enum { GOOD_FILES = sizeof good_files / sizeof good_files[0] };
 
@@ -448,10 +449,27 @@ TEST(mesh_files_that_mean_harm_are_refused_with_a_sentence)
     dist_context_destroy(ctx);
 }
 
+TEST(obj_vertices_that_are_not_there_are_told_as_the_file_counts)
+{
+    dist_context *ctx = test_context();
+    static const char *const files[][2] = {
+        {"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", "a face has vertex 4, must be 1 to 3"},
+        {"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", "byte 27: a face has vertex 0, must count from 1"},
+        {"v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -4\n", "a face has vertex -4, must count from 1"},
+        {"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 1 2 3\n", "a face has vertex 3, must be below 3"}};
+    for (size_t i = 0; i < sizeof files / sizeof files[0]; i++) {
+        CHECK(files_text(ctx, files[i][0]) == NULL);
+        CHECK_STATUS(DIST_BAD_FILE, dist_context_status(ctx), ctx);
+        CHECK_TEXT(files[i][1], dist_context_message(ctx));
+        dist_context_clear(ctx);
+    }
+    dist_context_destroy(ctx);
+}
+
 /* Bytes changed, cut out, doubled, or taken from elsewhere in the file. */
 static size_t files_mutate(test_random *r, unsigned char *bytes, size_t n)
 {
-    static const char spice[] = "0123456789-+.eE \n\tvf/#plyOFF\xff\x80\x7f";
+    static const char spice[] = "0123456789-+.eE \n\tvf/\\#plyOFF\xff\x80\x7f";
     int changes = test_random_int(r, 1, 4);
     for (int i = 0; i < changes && n > 2; i++) {
         size_t at = (size_t)test_random_int(r, 0, (int)n - 1), from = (size_t)test_random_int(r, 0, (int)n - 1);
@@ -668,6 +686,7 @@ int main(int argc, char **argv)
     RUN(decimals_are_those_of_printf_and_bring_every_float_back);
     RUN(normals_are_written_to_both_formats);
     RUN(every_dialect_reads_as_the_same_square);
+    RUN(obj_vertices_that_are_not_there_are_told_as_the_file_counts);
     RUN(binary_ply_of_mixed_types_is_read);
     RUN(lines_end_as_they_like_and_a_mark_of_utf8_is_no_vertex);
     RUN(mesh_files_that_mean_harm_are_refused_with_a_sentence);

@@ -7,7 +7,7 @@
    full speed. mode cold: every picture traced anew; warm: each
    starts from the last one; frame: depth, normals and mask, no gradient.
    bytes: most memory held beside the caller's planes and the weights. moved: mean change of depth of a step, in radii;
-   in the warm rows Adam's rate is lowered until that is at most 5e-4. render, backward: seconds of these parts;
+   in the warm rows Adam's rate is lowered until that is at most --moved. render, backward: seconds of these parts;
    their rates: dense multiply-adds (backward: a forward and a reverse pass a point) at the peak, over the time.
    network_rate: as the render's rate, over the time spent in the network alone, in blocks of points as the tracer asks
    them; 0: not measured (frames, more than 256 threads).
@@ -24,6 +24,7 @@ static const char usage[] =
     "  --size N           pixels along a side of the steps (default 512)\n"
     "  --steps N          measured steps of a fit (default 12)\n"
     "  --rate R           Adam's, at first (default 0.001)\n"
+    "  --moved R          of the warm rows: radii a step at most (default 0.0005)\n"
     "  --threads N        threads (default all)\n"
     "  --quick            128 pixels, few cases\n";
 
@@ -53,12 +54,11 @@ static const frame_case frames[] = {{"game_4x64", 4, 64, 512, 512}, {"game_2x32"
 
 enum { CASES = sizeof cases / sizeof cases[0], FRAME_CASES = sizeof frames / sizeof frames[0], STEPS_MOST = 1000 };
 static const double PAPER_QUERIES = 887000;
-static const double MOVED_MOST = 5e-4; /* radii a step in the warm rows */
 
 typedef struct settings {
     const char *only;
     int size, steps, threads, quick;
-    float rate;
+    float rate, moved;
 } settings;
 
 /* ---- memory ------------------------------------------------------------------------------------------------------ */
@@ -324,8 +324,8 @@ static void run_case(dist_context *ctx, const step_case *c, const settings *set,
         memory->most = memory->held;
         stepper s = stepper_create(ctx, net, c->code, set->size, rate, warm);
         row r = run_steps(&s, set->steps);
-        for (int i = 0; warm && i < 12 && r.moved > MOVED_MOST; i++) { /* about proportional to the rate */
-            rate *= (float)fmin(0.5, 0.9 * MOVED_MOST / r.moved);
+        for (int i = 0; warm && i < 12 && r.moved > (double)set->moved; i++) { /* about proportional to the rate */
+            rate *= (float)fmin(0.5, 0.9 * (double)set->moved / r.moved);
             stepper_destroy(&s);
             s = stepper_create(ctx, net, c->code, set->size, rate, warm);
             r = run_steps(&s, set->steps);
@@ -386,7 +386,7 @@ static void run_frames(dist_context *ctx, const char *name, int layers, int widt
 
 int main(int argc, char **argv)
 {
-    settings set = {NULL, 512, 12, 0, 0, 1e-3f};
+    settings set = {NULL, 512, 12, 0, 0, 1e-3f, 5e-4f};
     options o = options_begin(argc, argv, usage);
     while (option_next(&o)) {
         if (option_is(&o, "--case")) {
@@ -397,6 +397,8 @@ int main(int argc, char **argv)
             set.steps = option_int(&o, 1, STEPS_MOST);
         } else if (option_is(&o, "--rate")) {
             set.rate = (float)option_number(&o, 1e-9, 1e3);
+        } else if (option_is(&o, "--moved")) {
+            set.moved = (float)option_number(&o, 1e-9, 1);
         } else if (option_is(&o, "--threads")) {
             set.threads = option_int(&o, 1, 1024);
         } else if (option_is(&o, "--quick")) {

@@ -65,6 +65,15 @@ $(TEST_DIR)/test_%: tests/test_%.c dist.h $(wildcard tests/*.h)
 	@mkdir -p $(TEST_DIR)
 	$(CC) $(CFLAGS) $(TEST_FLAGS) $< -o $@ -lm
 
+# Tests of nothing but what dist.h declares share one translation of the rest, which takes ten seconds.
+SHARED = $(addprefix $(TEST_DIR)/test_,camera color context light loss render second warm weights)
+$(SHARED): $(TEST_DIR)/test_%: tests/test_%.c $(TEST_DIR)/dist.o $(wildcard tests/*.h examples/*.h bench/*.h)
+	$(CC) $(CFLAGS) $(TEST_FLAGS) -DTEST_SHARED $< $(TEST_DIR)/dist.o -o $@ -lm
+
+$(TEST_DIR)/dist.o: tests/small.c dist.h
+	@mkdir -p $(TEST_DIR)
+	$(CC) $(CFLAGS) $(TEST_FLAGS) -DSMALL_LIBRARY -c $< -o $@
+
 # Fetches Debian's package of the stb headers, without root and only if they are missing; a failure does no harm.
 build/stb/done:
 	@mkdir -p build/stb

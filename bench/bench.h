@@ -88,25 +88,4 @@ static inline double median(size_t n, double *values)
     return quantile(n, values, 0.5);
 }
 
-/* Biases of 1 and weights so small that no unit can reach 0. */
-static inline void make_alive(dist_context *ctx, dist_net *net)
-{
-    size_t n = dist_net_weight_count(net);
-    float *weights = take_floats(n);
-    memcpy(weights, dist_net_weights(net), n * sizeof *weights);
-    for (int l = 0; l + 1 < net->layers; l++) {
-        const disti_linear *layer = &net->layer[l];
-        float largest = 1.0f / sqrtf((float)layer->in); /* of PyTorch's start */
-        for (size_t i = 0; i < (size_t)layer->in * (size_t)layer->out; i++) {
-            weights[layer->weight + i] *= 0.4f / ((float)layer->in * largest);
-        }
-        for (size_t i = 0; i < (size_t)layer->out; i++) {
-            weights[layer->bias + i] = 1.0f;
-        }
-    }
-    dist_net_set_weights(ctx, net, weights);
-    check(ctx);
-    free(weights);
-}
-
 #endif

@@ -25,6 +25,7 @@ static const char usage[] =
     "  --steps N          measured steps of a fit (default 12)\n"
     "  --rate R           Adam's, at first (default 0.001)\n"
     "  --moved R          of the warm rows: radii a step at most (default 0.0005)\n"
+    "  --depth            depth alone, no silhouette\n"
     "  --threads N        threads (default all)\n"
     "  --quick            128 pixels, few cases\n";
 
@@ -59,6 +60,7 @@ typedef struct settings {
     const char *only;
     int size, steps, threads, quick;
     float rate, moved;
+    int depth; /* 1: no silhouette */
 } settings;
 
 /* ---- memory ------------------------------------------------------------------------------------------------------ */
@@ -151,8 +153,10 @@ typedef struct stepper {
     unsigned char *target_mask;
 } stepper;
 
-static stepper stepper_create(dist_context *ctx, const dist_net *net, int code, int size, float rate, int warm)
+static stepper stepper_create(dist_context *ctx, const dist_net *net, int code, const settings *set, float rate,
+                              int warm)
 {
+    int size = set->size;
     stepper s;
     memset(&s, 0, sizeof s);
     s.ctx = ctx;
@@ -179,10 +183,10 @@ static stepper stepper_create(dist_context *ctx, const dist_net *net, int code, 
     dist_render(ctx, &s.field, &s.camera, NULL, &s.out, NULL); /* what is to be reached */
     check(ctx);
     s.out.depth = take_floats(s.n);
-    s.out.silhouette = take_floats(s.n);
+    s.out.silhouette = set->depth ? NULL : take_floats(s.n);
     s.out.mask = (unsigned char *)take(s.n, 1);
     s.d_out.depth = take_floats(s.n);
-    s.d_out.silhouette = take_floats(s.n);
+    s.d_out.silhouette = set->depth ? NULL : take_floats(s.n);
     s.adam.rate = rate;
     s.adam.moments = take_floats(2 * s.code_size);
     rng r = rng_begin(1);
@@ -223,7 +227,7 @@ static double step_once(stepper *s, double *render, double *backward, double *ne
     s->out.stats = s->d_out.stats = &s->stats;
     double start = seconds_now();
     memset(s->d_out.depth, 0, s->n * sizeof(float));
-    memset(s->d_out.silhouette, 0, s->n * sizeof(float));
+    if (s->d_out.silhouette) { memset(s->d_out.silhouette, 0, s->n * sizeof(float)); }
     memset(s->d_code, 0, s->code_size * sizeof(float));
     dist_shape_set_code(s->shape, s->code);
     network_spent();
@@ -232,7 +236,9 @@ static double step_once(stepper *s, double *render, double *backward, double *ne
     *render = seconds_now() - render_start;
     *network = network_spent();
     dist_loss_depth(s->n, s->out.depth, s->target, s->out.mask, 10.0f, s->d_out.depth);
-    dist_loss_silhouette(s->n, s->out.silhouette, s->target_mask, 1.0f, s->d_out.silhouette);
+    if (s->out.silhouette) {
+        dist_loss_silhouette(s->n, s->out.silhouette, s->target_mask, 1.0f, s->d_out.silhouette);
+    }
     dist_loss_code(s->code_size, s->code, 1.0f / (float)s->code_size, s->d_code);
     double backward_start = seconds_now();
     dist_render_backward(s->ctx, s->tape, &s->d_out, &grads);
@@ -322,12 +328,12 @@ static void run_case(dist_context *ctx, const step_case *c, const settings *set,
     for (int warm = 0; warm < 2; warm++) {
         float rate = set->rate;
         memory->most = memory->held;
-        stepper s = stepper_create(ctx, net, c->code, set->size, rate, warm);
+        stepper s = stepper_create(ctx, net, c->code, set, rate, warm);
         row r = run_steps(&s, set->steps);
         for (int i = 0; warm && i < 12 && r.moved > (double)set->moved; i++) { /* about proportional to the rate */
             rate *= (float)fmin(0.5, 0.9 * (double)set->moved / r.moved);
             stepper_destroy(&s);
-            s = stepper_create(ctx, net, c->code, set->size, rate, warm);
+            s = stepper_create(ctx, net, c->code, set, rate, warm);
             r = run_steps(&s, set->steps);
         }
         print_row(c->name, warm ? "warm" : "cold", set->size, set->size, ctx, (double)dist_net_operations(net, 0), &r,
@@ -386,7 +392,7 @@ static void run_frames(dist_context *ctx, const char *name, int layers, int widt
 
 int main(int argc, char **argv)
 {
-    settings set = {NULL, 512, 12, 0, 0, 1e-3f, 5e-4f};
+    settings set = {NULL, 512, 12, 0, 0, 1e-3f, 5e-4f, 0};
     options o = options_begin(argc, argv, usage);
     while (option_next(&o)) {
         if (option_is(&o, "--case")) {
@@ -397,6 +403,8 @@ int main(int argc, char **argv)
             set.steps = option_int(&o, 1, STEPS_MOST);
         } else if (option_is(&o, "--rate")) {
             set.rate = (float)option_number(&o, 1e-9, 1e3);
+        } else if (option_is(&o, "--depth")) {
+            set.depth = 1;
         } else if (option_is(&o, "--moved")) {
             set.moved = (float)option_number(&o, 1e-9, 1);
         } else if (option_is(&o, "--threads")) {

@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: MIT-0
-   peak.h - the multiply-add peak of the processor, measured. Include it after common.h. */
+   peak.h - the multiply-add peak of the processor, measured, and nets without a dead unit. Include it after common.h. */
 #ifndef DIST_BENCH_PEAK_H
 #define DIST_BENCH_PEAK_H
 
@@ -171,6 +171,29 @@ static inline double peak_half(dist_context *ctx, int half, long loops, double *
 static inline double peak_once(dist_context *ctx, long loops, double *taken)
 {
     return peak_half(ctx, DIST_HALF_OFF, loops, taken);
+}
+
+/* ---- a net that asks for all of it ------------------------------------------------------------------------------- */
+
+/* Biases of 1 and weights so small that no unit can reach 0. */
+static inline void make_alive(dist_context *ctx, dist_net *net)
+{
+    size_t n = dist_net_weight_count(net);
+    float *weights = take_floats(n);
+    memcpy(weights, dist_net_weights(net), n * sizeof *weights);
+    for (int l = 0; l + 1 < net->layers; l++) {
+        const disti_linear *layer = &net->layer[l];
+        float largest = 1.0f / sqrtf((float)layer->in); /* of PyTorch's start */
+        for (size_t i = 0; i < (size_t)layer->in * (size_t)layer->out; i++) {
+            weights[layer->weight + i] *= 0.4f / ((float)layer->in * largest);
+        }
+        for (size_t i = 0; i < (size_t)layer->out; i++) {
+            weights[layer->bias + i] = 1.0f;
+        }
+    }
+    dist_net_set_weights(ctx, net, weights);
+    check(ctx);
+    free(weights);
 }
 
 #endif

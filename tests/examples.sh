@@ -101,7 +101,8 @@ expect_nothing refusals_write_no_file "$work/found"
 for file in bench/*.c; do
     [ -e "$file" ] || continue
     name=$(basename "$file" .c)
-    expect "${name}_is_strict" $CC -std=c99 -O0 $warnings -Wmissing-prototypes -isystem build/stb/usr/include \
-        -c "$file" -o "$work/$name.o"
+    # What the optimizer finds, make says: it builds them with the same warnings.
+    expect "${name}_is_strict" $CC -std=c99 $warnings -Wmissing-prototypes -isystem build/stb/usr/include \
+        -fsyntax-only "$file"
 done
 [ -n "$found" ] || skip examples "there are none"

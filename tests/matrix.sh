@@ -94,7 +94,8 @@ if [ -n "$quick" ]; then
     have gcc && cc=gcc
     if can $cc $sanitize; then
         # test_gradients takes minutes there; the backward pass is in others, random scenes among them. test_needs counts.
-        set -- $(basename -s .c tests/test_*.c | grep -v -e gradients -e needs)
+        slow="test_trace test_tools test_warm" # first, so that both are busy to the end
+        set -- $slow $(basename -s .c tests/test_*.c | grep -v -e gradients -e needs -e trace -e tools -e warm)
         row sanitizers build/matrix/sanitizers $cc "$sanitize" "" 1 "" "$@"
     else
         skip_row sanitizers "$cc has no sanitizers here"
@@ -107,7 +108,7 @@ if [ -n "$quick" ]; then
         test_camera
     isa_row scalar build $cc "-O2" scalar 1 "$@" # test_trace takes minutes there
     if grep -q '^flags.* avx512vl' /proc/cpuinfo 2>/dev/null; then
-        isa_row avx2 build $cc "-O2" avx2 1 "$@" test_trace test_gradients test_warm
+        isa_row avx2 build $cc "-O2" avx2 1 test_trace test_gradients test_warm "$@"
     else
         skip_row avx2 "make test has run with it if this processor has it"
     fi
@@ -140,7 +141,7 @@ else
 fi
 
 if can gcc -mfpmath=387 -fexcess-precision=fast; then # registers that hold more than a float, as 32-bit x86 without SSE has
-    row x87 build/matrix/x87 gcc "-O2 -mfpmath=387 -fexcess-precision=fast" "" 1 "" ${quick:+test_scene test_camera test_tools}
+    row x87 build/matrix/x87 gcc "-O2 -mfpmath=387 -fexcess-precision=fast" "" 1 "" ${quick:+test_tools test_scene test_camera}
 else
     skip_row x87 "gcc -mfpmath=387 does not work here"
 fi

@@ -11,7 +11,7 @@
 # A program ends with a line "N passed, N failed, N skipped"; a script prints "ok NAME", "not ok NAME: why" or
 # "skip NAME: why" for each test. One that does not end as it should is one more failure.
 
-script_tests="languages readme options symbols layers source examples results"
+script_tests="results examples options languages symbols layers source readme"
 
 folder=build
 emulator=
@@ -81,12 +81,15 @@ shift $((OPTIND - 1))
 
 names=$*
 if [ -z "$names" ]; then
-    # The scripts first: they take longest.
+    # What takes longest first, so that both are busy to the end.
     [ -n "$scripts" ] && names=$script_tests
+    for name in trace tools warm gradients needs; do
+        [ -e "tests/test_$name.c" ] && names="$names test_$name"
+    done
     for file in tests/test_*.c; do
         [ -e "$file" ] || continue
         name=${file##*/}
-        names="$names ${name%.c}"
+        case " $names " in *" ${name%.c} "*) ;; *) names="$names ${name%.c}" ;; esac
     done
 fi
 rm -rf "$folder/log" "$folder/tmp"

@@ -259,19 +259,26 @@ TEST_UNUSED static int shape_enter(const double o[3], const double d[3], double 
 }
 
 /* Ray of pixel (x, y) in double, and its direction's z in the camera. The rotation is taken orthonormal, as the
-   library does. */
+   library does: the first row, the second without its part along that, and their cross product. */
 TEST_UNUSED static double shape_pixel(const dist_camera *camera, int x, int y, double o[3], double d[3])
 {
-    disti_view view;
-    double v[3];
-    disti_view_of(camera, &view);
+    double r[9], v[3], along = 0;
+    for (int i = 0; i < 6; i++) r[i] = (double)camera->rotation[i];
+    for (int row = 0; row < 6; row += 3) {
+        for (int i = 0; i < 3; i++) along += row ? r[i] * r[3 + i] : 0;
+        for (int i = 0; i < 3; i++) r[row + i] -= row ? along * r[i] : 0;
+        double size = shape_length(r[row], r[row + 1], r[row + 2]);
+        for (int i = 0; i < 3; i++) r[row + i] /= size;
+    }
+    for (int i = 0; i < 3; i++) r[6 + i] = r[(i + 1) % 3] * r[3 + (i + 2) % 3] - r[(i + 2) % 3] * r[3 + (i + 1) % 3];
     v[1] = (y + (double)camera->pixel_center - (double)camera->cy) / (double)camera->fy;
     v[0] = (x + (double)camera->pixel_center - (double)camera->cx - (double)camera->skew * v[1]) / (double)camera->fx;
     v[2] = 1;
     double length = shape_length(v[0], v[1], v[2]);
     for (int i = 0; i < 3; i++) {
-        d[i] = (view.rotation[i] * v[0] + view.rotation[3 + i] * v[1] + view.rotation[6 + i] * v[2]) / length;
-        o[i] = view.center[i];
+        d[i] = (r[i] * v[0] + r[3 + i] * v[1] + r[6 + i] * v[2]) / length;
+        o[i] = 0;
+        for (int k = 0; k < 3; k++) o[i] -= r[3 * k + i] * (double)camera->translation[k];
     }
     return 1 / length;
 }

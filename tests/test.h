@@ -28,7 +28,8 @@
 #ifndef DIST_TEST_H
 #define DIST_TEST_H
 
-#ifndef DIST_IMPLEMENTATION
+/* TEST_SHARED: the implementation is linked in, for programs that use nothing beyond the declarations. */
+#if !defined(DIST_IMPLEMENTATION) && !defined(TEST_SHARED)
 #define DIST_IMPLEMENTATION
 #endif
 #include "../dist.h"
@@ -369,6 +370,7 @@ TEST_UNUSED static dist_allocator test_allocator_hook(test_allocator *a)
     return hook;
 }
 
+#ifndef TEST_SHARED
 /* Fills what the context's workers work in: no result may depend on what an earlier call has left there. */
 TEST_UNUSED static void test_soil(dist_context *ctx, int byte)
 {
@@ -376,6 +378,7 @@ TEST_UNUSED static void test_soil(dist_context *ctx, int byte)
     if (ctx->lanes) memset(ctx->lanes, byte, (size_t)ctx->workers * ctx->lane_bytes);
     if (ctx->partial) memset(ctx->partial, byte, DISTI_SLOTS * ctx->partial_size * sizeof(double));
 }
+#endif
 
 /* ---- a scheduler without threads --------------------------------------------------------------------------------- */
 

@@ -888,7 +888,7 @@ TEST(color_gradients_too_large_for_floats_spoil_no_weight)
         grads.weights = weights;
         d_color[channel] = d_color[3 + channel] = 3e38f;
         CHECK_STATUS(DIST_OK, dist_color_backward(ctx, &field, 2, points, d_color, NULL, &grads), ctx);
-        CHECK(disti_finite_all(count, weights));
+        for (size_t i = 0; i < count; i++) CHECK(test_finite((double)weights[i]));
     }
     dist_shape_destroy(shape), dist_net_destroy(net), dist_context_destroy(ctx);
     free(weights);

@@ -548,12 +548,13 @@ TEST(rows_that_are_left_out_change_no_bit)
         dist_field field = dist_shape_field(shape);
         test_random random = test_random_seed(3);
         float spread[3] = {0.02f, 0.4f, 0.1f}; /* near each other, a sheet, and in between */
+        size_t less = from > 1 && test_quick() ? 4 : 1;
         double done[3] = {0, 0, 0};
         CHECK(shape->groups == 2 || from < 2); /* memory for them has every net that is wide enough */
         for (int round = 0; round < 3; round++) {
             test_random_fill(&random, 3 * MANY, points, -spread[round], spread[round]);
             for (int i = 0; i < MANY && round == 1; i++) points[3 * i] = 0.3f;
-            size_t n = round == 2 ? MANY : MANY / 2;
+            size_t n = (round == 2 ? MANY : MANY / 2) / less;
             for (int mode = 0; mode < 3; mode++) { /* groups, blocks, one by one */
                 disti_counter *counter = disti_counter_of(ctx, 0);
                 counter->done = 0;
@@ -578,8 +579,8 @@ TEST(rows_that_are_left_out_change_no_bit)
         int worse = 0; /* points that are not finite are no others' business */
         for (int i = 0; i < MANY; i += 7) points[3 * i + i % 3] = i % 2 ? NAN : INFINITY;
         shape->groups = 2;
-        field.eval_fn(field.user, 0, MANY, points, sdf[0], NULL);
-        for (int i = 0; i < MANY; i++) {
+        field.eval_fn(field.user, 0, MANY / less, points, sdf[0], NULL);
+        for (size_t i = 0; i < MANY / less; i++) {
             if (i % 7 == 0) continue;
             field.eval_fn(field.user, 0, 1, points + 3 * i, sdf[1], NULL);
             worse += memcmp(sdf[1], sdf[0] + i, sizeof(float)) != 0;
@@ -732,7 +733,7 @@ TEST(a_geometric_start_is_near_the_distance_to_a_sphere_of_half_the_bound)
                    {4, 256, DIST_ACTIVATION_SOFTPLUS, 6, 0, 1, 0.5},  {4, 256, DIST_ACTIVATION_SOFTPLUS, 0, 0, 2, 0.6},
                    {8, 512, DIST_ACTIVATION_SOFTPLUS, 0, 0, 1, 0.4},  {8, 512, DIST_ACTIVATION_SOFTPLUS, 0, 30, 1, 0.1},
                    {8, 512, DIST_ACTIVATION_SOFTPLUS, 0, 100, 0.4f, 0.1}};
-    for (int k = 0; k < 9; k++) {
+    for (int k = 0; k < 9; k += test_quick() ? 2 : 1) {
         const struct start *start = &starts[k];
         double bound = (double)start->bound, half, all;
         dist_context *ctx = test_context();

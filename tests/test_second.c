@@ -814,7 +814,7 @@ TEST(points_that_are_not_finite_take_nothing_from_the_others)
                 else
                     CHECK_STATUS(DIST_OK, dist_field_backward(ctx, &field, n, points, seeds, NULL, NULL, d_points,
                                                               &grads), ctx);
-                for (size_t j = 0; j < 3 * n; j++) CHECK(disti_finite(d_points[j]));
+                for (size_t j = 0; j < 3 * n; j++) CHECK(test_finite((double)d_points[j]));
             }
             double largest = 0;
             for (int j = 0; j < field.code_size; j++) largest = fmax(largest, fabs((double)grads_code[0][j]));

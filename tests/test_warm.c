@@ -456,7 +456,7 @@ static dist_net *random_net(dist_context *ctx, test_random *random, const float 
             low[inside] = fmin(low[inside], (double)sdf[i]);
             high[inside] = fmax(high[inside], (double)sdf[i]);
             const float *g = gradient + 3 * i;
-            slope += inside * (double)disti_length(g[0], g[1], g[2]) / SAMPLES;
+            slope += inside * shape_length((double)g[0], (double)g[1], (double)g[2]) / SAMPLES;
         }
         dist_shape_destroy(shape);
     }

@@ -449,7 +449,7 @@ TEST(mesh_files_that_mean_harm_are_refused_with_a_sentence)
     dist_context_destroy(ctx);
 }
 
-TEST(obj_vertices_that_are_not_there_are_told_as_the_file_counts)
+TEST(what_a_mesh_file_has_wrong_is_told_as_the_file_counts)
 {
     dist_context *ctx = test_context();
     static const char *const files[][2] = {
@@ -463,6 +463,12 @@ TEST(obj_vertices_that_are_not_there_are_told_as_the_file_counts)
         CHECK_TEXT(files[i][1], dist_context_message(ctx));
         dist_context_clear(ctx);
     }
+    char many[1024] = "ply\nformat ascii 1.0\n";
+    for (int i = 0; i < 17; i++) strcat(many, "element more 0\nproperty int a\n");
+    strcat(many, "end_header\n");
+    CHECK(files_text(ctx, many) == NULL);
+    CHECK_STATUS(DIST_UNSUPPORTED, dist_context_status(ctx), ctx);
+    CHECK_TEXT("more than 16 PLY elements", dist_context_message(ctx));
     dist_context_destroy(ctx);
 }
 
@@ -686,7 +692,7 @@ int main(int argc, char **argv)
     RUN(decimals_are_those_of_printf_and_bring_every_float_back);
     RUN(normals_are_written_to_both_formats);
     RUN(every_dialect_reads_as_the_same_square);
-    RUN(obj_vertices_that_are_not_there_are_told_as_the_file_counts);
+    RUN(what_a_mesh_file_has_wrong_is_told_as_the_file_counts);
     RUN(binary_ply_of_mixed_types_is_read);
     RUN(lines_end_as_they_like_and_a_mark_of_utf8_is_no_vertex);
     RUN(mesh_files_that_mean_harm_are_refused_with_a_sentence);

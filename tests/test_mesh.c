@@ -797,6 +797,34 @@ TEST(chamfer_refuses_points_that_are_not_finite_and_empty_clouds)
     dist_context_destroy(ctx);
 }
 
+TEST(what_a_mesh_has_not_is_told)
+{
+    dist_context *ctx = test_context();
+    float vertices[9] = {0, 0, 0, 0, 0, 0, 0, 0, 0}, point[3], d_vertices[9] = {0}, sphere[4] = {0, 0, 0, 0.5f};
+    unsigned triangle[3] = {0, 1, 2};
+    size_t size = 0;
+    uint32_t bits = 0xff800000u;
+    dist_mesh *mesh = dist_mesh_create(ctx, 3, vertices, 1, triangle);
+    dist_field field = dist_field_sphere(sphere);
+    dist_gradients grads;
+    memset(&grads, 0, sizeof grads);
+    REQUIRE(mesh);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_mesh_sample(ctx, mesh, 1, 1, point), ctx);
+    CHECK_TEXT("dist_mesh_sample: the mesh's area is 0, must be positive", dist_context_message(ctx));
+    dist_context_clear(ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_mesh_write(ctx, mesh, 2, NULL, 0, &size), ctx);
+    CHECK_TEXT("dist_mesh_write: format is 2, must be DIST_MESH_PLY or DIST_MESH_OBJ", dist_context_message(ctx));
+    dist_context_clear(ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_mesh_backward(ctx, &field, mesh, NULL, &grads), ctx);
+    CHECK_TEXT("dist_mesh_backward: d_vertices is NULL", dist_context_message(ctx));
+    dist_context_clear(ctx);
+    memcpy(d_vertices + 7, &bits, sizeof bits);
+    CHECK_STATUS(DIST_NOT_FINITE, dist_mesh_backward(ctx, &field, mesh, d_vertices, &grads), ctx);
+    CHECK_TEXT("dist_mesh_backward: d_vertices of vertex 2 is not finite", dist_context_message(ctx));
+    dist_mesh_destroy(mesh);
+    dist_context_destroy(ctx);
+}
+
 TEST(every_allocation_of_sampling_and_chamfer_may_fail)
 {
     float vertices[9] = {0, 0, 0, 1, 0, 0, 0, 1, 0}, p[30];
@@ -848,6 +876,7 @@ int main(int argc, char **argv)
     RUN(chamfer_of_30000_points_is_quick_for_every_kind_of_cloud);
     RUN(chamfer_gives_the_same_bits_for_every_worker_count);
     RUN(chamfer_refuses_points_that_are_not_finite_and_empty_clouds);
+    RUN(what_a_mesh_has_not_is_told);
     RUN(every_allocation_of_sampling_and_chamfer_may_fail);
     return test_report();
 }

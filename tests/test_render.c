@@ -946,6 +946,7 @@ TEST(a_tape_is_for_its_size_and_trace)
     dist_context *ctx = shape_context(), *other = shape_context();
     dist_camera camera = shape_camera(16, 12), wide = shape_camera(12, 16);
     test_shape shape = some_shape(0);
+    float sphere[4] = {0, 0, 0, 0.5f};
     dist_field field = shape_field(&shape, 1, 1);
     dist_render_desc paper = plain_how(), more = plain_how();
     paper.trace = more.trace = DIST_TRACE_PAPER;
@@ -962,8 +963,35 @@ TEST(a_tape_is_for_its_size_and_trace)
     dist_context_clear(ctx);
     CHECK_STATUS(DIST_BAD_ARGUMENT, dist_render(ctx, &field, &camera, &more, &out, paper_tape), ctx);
     CHECK_TEXT("samples", dist_context_message(ctx));
+    dist_context_clear(ctx);
     CHECK_STATUS(DIST_BAD_ARGUMENT, dist_render(other, &field, &camera, NULL, &out, tape), other);
     CHECK_TEXT("another context", dist_context_message(other));
+    dist_render_desc warm = plain_how();
+    warm.warm_start = 1;
+    for (int k = 0; k < 2; k++) {
+        CHECK_STATUS(DIST_BAD_ARGUMENT, dist_render(ctx, &field, &camera, &warm, &out, k ? tape : NULL), ctx);
+        CHECK_TEXT(k ? "how.warm_start is 1, but tape is not made with it" : "how.warm_start is 1, but tape is NULL",
+                   dist_context_message(ctx));
+        dist_context_clear(ctx);
+    }
+#ifndef DIST_NO_BACKWARD
+    static float d_silhouette[16 * 12];
+    float d_code[4] = {0, 0, 0, 0}, point[3] = {0, 0, 0};
+    dist_images d_out;
+    dist_gradients grads;
+    memset(&d_out, 0, sizeof d_out);
+    memset(&grads, 0, sizeof grads);
+    d_out.silhouette = d_silhouette;
+    grads.code = d_code;
+    field = dist_field_sphere(sphere);
+    out.silhouette = NULL;
+    CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, tape), ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_render_backward(ctx, tape, &d_out, &grads), ctx);
+    CHECK_TEXT("d_out.silhouette is given, but out.silhouette was NULL", dist_context_message(ctx));
+    dist_context_clear(ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_backward(ctx, &field, 1, point, NULL, NULL, NULL, NULL, &grads), ctx);
+    CHECK_TEXT("dist_field_backward: d_sdf is NULL, needed without seed_fn", dist_context_message(ctx));
+#endif
     dist_tape_destroy(tape);
     dist_tape_destroy(paper_tape);
     dist_tape_destroy(NULL);

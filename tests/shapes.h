@@ -262,14 +262,14 @@ TEST_UNUSED static int shape_enter(const double o[3], const double d[3], double 
    library does: the first row, the second without its part along that, and their cross product. */
 TEST_UNUSED static double shape_pixel(const dist_camera *camera, int x, int y, double o[3], double d[3])
 {
-    double r[9], v[3], along = 0;
+    double r[9], v[3];
     for (int i = 0; i < 6; i++) r[i] = (double)camera->rotation[i];
-    for (int row = 0; row < 6; row += 3) {
-        for (int i = 0; i < 3; i++) along += row ? r[i] * r[3 + i] : 0;
-        for (int i = 0; i < 3; i++) r[row + i] -= row ? along * r[i] : 0;
-        double size = shape_length(r[row], r[row + 1], r[row + 2]);
-        for (int i = 0; i < 3; i++) r[row + i] /= size;
-    }
+    double size = shape_length(r[0], r[1], r[2]);
+    for (int i = 0; i < 3; i++) r[i] /= size;
+    double along = r[0] * r[3] + r[1] * r[4] + r[2] * r[5];
+    for (int i = 0; i < 3; i++) r[3 + i] -= along * r[i];
+    size = shape_length(r[3], r[4], r[5]);
+    for (int i = 0; i < 3; i++) r[3 + i] /= size;
     for (int i = 0; i < 3; i++) r[6 + i] = r[(i + 1) % 3] * r[3 + (i + 2) % 3] - r[(i + 2) % 3] * r[3 + (i + 1) % 3];
     v[1] = (y + (double)camera->pixel_center - (double)camera->cy) / (double)camera->fy;
     v[0] = (x + (double)camera->pixel_center - (double)camera->cx - (double)camera->skew * v[1]) / (double)camera->fx;

@@ -10659,7 +10659,7 @@ enum { DISTI_TILE = 88, DISTI_TILE_USUAL = 64, DISTI_TILE_RAYS = (DISTI_TILE + 1
 /* Spheres that samples of the tile's rays prove empty, and the parts of each ray that those of the rays around it
    cover, looked up when it sets out. A ray that is about to step skips what is covered. Pool full: no more are kept. */
 enum { DISTI_POOL = 2816, DISTI_BALLS = 12, DISTI_COVERS = 12, DISTI_SPANS = 20 * DISTI_BALLS };
-enum { DISTI_LOOKED = 64 }; /* pixels that a ray looks at: no more than eight a side */
+enum { DISTI_WINDOW = 4, DISTI_LOOKED = 4 * DISTI_WINDOW * DISTI_WINDOW }; /* pixels a ray looks at, on each side */
 
 typedef struct disti_cover {
     float begin, end; /* covered without a gap; what lies before is of no use */
@@ -10673,7 +10673,7 @@ typedef struct disti_clear { /* a pixel's largest balls */
 } disti_clear;
 
 typedef struct disti_balls {
-    int stride, window;                       /* rays look at every stride-th pixel less than window away */
+    int stride;                               /* rays look at every stride-th pixel */
     int clears, covers;                       /* taken of the pools */
     unsigned char reach[DISTI_TILE_RAYS];     /* square of the pixel's largest radius in pixels, 1 to 255; 0: no ball */
     unsigned short clear_of[DISTI_TILE_RAYS]; /* the place of a pixel's balls, if it has any */
@@ -10778,12 +10778,11 @@ static void disti_ray_point(const disti_ray *ray, float s, float p[3])
     for (int i = 0; i < 3; i++) p[i] = ray->origin[i] + s * ray->direction[i];
 }
 
-/* From now on rays look this far, and none has looked yet: the covers' places are free again. */
-static void disti_balls_look(const disti_bench *bench, int stride, int window)
+/* From now on rays look at every stride-th pixel, and none has looked yet: the covers' places are free again. */
+static void disti_balls_look(const disti_bench *bench, int stride)
 {
     disti_balls *balls = bench->balls;
     balls->stride = stride;
-    balls->window = window;
     balls->covers = 0;
     memset(balls->cover_of, 0, (size_t)(bench->width * bench->height) * sizeof *balls->cover_of);
 }
@@ -10861,9 +10860,9 @@ static void disti_cover_begin(const disti_bench *bench, int index, const disti_r
 {
     const disti_balls *balls = bench->balls;
     float from[DISTI_SPANS], to[DISTI_SPANS], next = 0.0f;
-    int width = bench->width, x = index % width, y = index / width, h = balls->stride, window = balls->window, n = 0;
-    int x0 = DISTI_MAX(x - window + h, 0) / h * h, x1 = DISTI_MIN(x + window, width - 1);
-    int y0 = DISTI_MAX(y - window + h, 0) / h * h, y1 = DISTI_MIN(y + window, bench->height - 1);
+    int width = bench->width, x = index % width, y = index / width, h = balls->stride, n = 0;
+    int x0 = DISTI_MAX(x - DISTI_WINDOW + h, 0) / h * h, x1 = DISTI_MIN(x + DISTI_WINDOW, width - 1);
+    int y0 = DISTI_MAX(y - DISTI_WINDOW + h, 0) / h * h, y1 = DISTI_MIN(y + DISTI_WINDOW, bench->height - 1);
     int found[DISTI_LOOKED], count = 0; /* listed without a branch, which could not be foretold */
     for (int row = y0; row <= y1; row += h) {
         const unsigned char *reach = balls->reach + row * width;
@@ -12658,7 +12657,7 @@ static void disti_lattice_balls(const disti_tracer *tracer, const disti_tile *ti
     bench->least = 0.4f * disti_pixel_width(tracer, tile);
     bench->balls->clears = 0;
     memset(bench->balls->reach, 0, (size_t)(bench->width * bench->height));
-    disti_balls_look(bench, tile->lattice, 3);
+    disti_balls_look(bench, tile->lattice);
 }
 
 /* Lists what a pass asks for of the block of DISTI_PASS_BLOCK * h pixels at (x0, y0), after the `active` rays that are
@@ -12708,7 +12707,7 @@ static void disti_trace_lattice(const disti_tracer *tracer, int worker, const di
     if (tile->cheap && tile->normals) bench->gradient = (float *)(void *)bench->rest; /* the cones are done with */
     for (int h = tile->lattice / 2; h > 0; h /= 2) {
         for (int pass = 1; pass <= 2; pass++) { /* between two known pixels, then amid four */
-            if (bench->balls) disti_balls_look(bench, h, DISTI_MIN(h + 3, 6));
+            if (bench->balls) disti_balls_look(bench, h);
             int side = DISTI_PASS_BLOCK * h;
             for (int y = 0; y < tile->height; y += side)
                 for (int x = 0; x < tile->width; x += side)

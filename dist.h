@@ -10659,7 +10659,8 @@ enum { DISTI_TILE = 88, DISTI_TILE_USUAL = 64, DISTI_TILE_RAYS = (DISTI_TILE + 1
 /* Spheres that samples of the tile's rays prove empty, and the parts of each ray that those of the rays around it
    cover, looked up when it sets out. A ray that is about to step skips what is covered. Pool full: no more are kept. */
 enum { DISTI_POOL = 2816, DISTI_BALLS = 12, DISTI_COVERS = 12, DISTI_SPANS = 20 * DISTI_BALLS };
-enum { DISTI_WINDOW = 4, DISTI_LOOKED = 4 * DISTI_WINDOW * DISTI_WINDOW }; /* pixels a ray looks at, on each side */
+/* A ray looks at the pixels up to DISTI_WINDOW to the right and below, and less than that to the left and above. */
+enum { DISTI_WINDOW = 4, DISTI_LOOKED = 4 * DISTI_WINDOW * DISTI_WINDOW };
 
 typedef struct disti_cover {
     float begin, end; /* covered without a gap; what lies before is of no use */

@@ -85,6 +85,7 @@ static int whole_life(test_allocator *allocator, const dist_context_desc *desc, 
     memset(&adam, 0, sizeof adam);
     memset(moments, 0, sizeof moments);
     memset(weights, 0, sizeof weights);
+    memset(points, 0, sizeof points); /* of a sample for which no memory was left */
     adam.moments = moments;
     mesh_desc.resolution = 12;
     mesh_desc.normals = 1;

@@ -1762,7 +1762,10 @@ static dist_status disti_context_begin(dist_context *ctx, const dist_context_des
     if (!ctx->scheduler.run_fn) ctx->workers = 1;
 #endif
     ctx->scratch = (unsigned char *)disti_alloc_array(ctx, (size_t)ctx->workers, DISTI_SCRATCH_BYTES);
-    return ctx->scratch ? DIST_OK : DIST_OUT_OF_MEMORY;
+    if (!ctx->scratch) return DIST_OUT_OF_MEMORY;
+    for (int worker = 0; worker < ctx->workers; worker++)
+        memset(disti_counter_of(ctx, worker), 0, sizeof(disti_counter));
+    return DIST_OK;
 }
 
 /* desc's allocator, or malloc's. 0: only half of one, or none and no malloc. */

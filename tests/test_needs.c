@@ -247,6 +247,55 @@ TEST(bounds_hold_against_nets_in_double)
     }
 }
 
+/* malloc's, filled: what a shape is found to gain by bounds must not depend on what the memory held before. */
+static void *filled_alloc(void *user, size_t bytes, size_t alignment)
+{
+    unsigned char *raw = (unsigned char *)malloc(bytes + alignment);
+    if (!raw) return NULL;
+    size_t shift = alignment - (size_t)((uintptr_t)raw % alignment); /* 1 to alignment: kept in the byte before */
+    raw[shift - 1] = (unsigned char)shift;
+    memset(raw + shift, *(const unsigned char *)user, bytes);
+    return raw + shift;
+}
+
+static void filled_free(void *user, void *p, size_t bytes)
+{
+    unsigned char *q = (unsigned char *)p;
+    (void)user;
+    (void)bytes;
+    free(q - q[-1]);
+}
+
+TEST(a_shape_does_not_depend_on_what_its_memory_held)
+{
+    static unsigned char fills[] = {0x00, 0x01, 0x3f, 0x7f, 0x80, 0xff};
+    static float depth[SIZE * SIZE];
+    double done[sizeof fills];
+    for (int i = 0; i < (int)sizeof fills; i++) {
+        dist_context_desc desc;
+        dist_images out;
+        dist_stats stats;
+        memset(&desc, 0, sizeof desc);
+        memset(&out, 0, sizeof out);
+        desc.allocator.user = &fills[i];
+        desc.allocator.alloc_fn = filled_alloc;
+        desc.allocator.free_fn = filled_free;
+        dist_context *ctx = dist_context_create(&desc);
+        dist_net *net = load_embedded(ctx);
+        dist_shape *shape = dist_shape_create(ctx, net, dist_net_code(net, 0));
+        dist_field field = dist_shape_field(shape);
+        dist_camera camera = bench_camera(&field, SIZE, SIZE);
+        out.depth = depth;
+        out.stats = &stats;
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, NULL), ctx);
+        done[i] = stats.operations_done;
+        CHECK_EQUAL(done[0], done[i]);
+        dist_shape_destroy(shape);
+        dist_net_destroy(net);
+        dist_context_destroy(ctx);
+    }
+}
+
 int main(int argc, char **argv)
 {
     test_begin(argc, argv);
@@ -261,6 +310,7 @@ int main(int argc, char **argv)
     RUN(silhouette_of_the_fox_costs_less_than_45000_queries);
     RUN(silhouette_of_rings_costs_less_than_45000_queries);
     RUN(memory_is_the_tracers_and_the_nets_and_a_tape_only_where_one_is_wanted);
+    RUN(a_shape_does_not_depend_on_what_its_memory_held);
     RUN(exact_of_the_embedded_model);
     RUN(exact_of_bob_spot);
     RUN(exact_of_chairs);

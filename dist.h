@@ -10113,7 +10113,7 @@ static float disti_ray_room(const disti_tracer *tracer, float a, float fa, float
 static int disti_ray_alone(const disti_tracer *tracer, const disti_ray *ray, float a, float fa, float b, float fb,
                            float most)
 {
-    float room = tracer->how.certified ? disti_ray_epsilon(tracer, ray, ray->s) : most * tracer->field->radius;
+    float room = tracer->how.certified ? disti_ray_epsilon(tracer, ray, ray->s) : most * tracer->detail;
     return disti_ray_room(tracer, a, fa, b, fb) <= room;
 }
 
@@ -10164,7 +10164,7 @@ static float disti_ray_floor(const disti_tracer *tracer, const disti_ray *ray)
 {
     if (tracer->how.certified) return 0.0f;
     float patience = ray->steps > 20 ? 1.0f + 0.1f * (float)(ray->steps - 20) : 1.0f;
-    float pixel = 2.0f * (float)(ray->base + (double)ray->s) * ray->footprint, radius = tracer->field->radius;
+    float pixel = 2.0f * (float)(ray->base + (double)ray->s) * ray->footprint, radius = tracer->detail;
     return patience * DISTI_MAX(5e-4f * radius, DISTI_MIN(pixel, 3e-3f * radius));
 }
 
@@ -10203,8 +10203,8 @@ static float disti_ray_jump(const disti_tracer *tracer, const disti_ray *ray, fl
     float cap = 3.0f * radius + epsilon;
     if (solid || beyond <= cap) return solid ? 0.0f : beyond;
     /* short of the end: f must still be positive there, or something came in between */
-    if (DISTI_MAX(ray->f, radius) < 5e-3f * tracer->field->radius)
-        cap = DISTI_MAX(cap, 1e-2f * tracer->field->radius);
+    if (DISTI_MAX(ray->f, radius) < 5e-3f * tracer->detail)
+        cap = DISTI_MAX(cap, 1e-2f * tracer->detail);
     return DISTI_MIN(0.97f * jump, cap);
 }
 
@@ -10226,7 +10226,7 @@ static int disti_ray_step(const disti_tracer *tracer, disti_ray *ray)
     float step = radius * DISTI_MIN(stretch, 8.0f), jump = 0.0f;
     int local = ray->fa > 0.0f; /* the slope; one over what was skipped says nothing of what comes next */
     int tells = told || (ray->known && (local || certified));
-    if (tells && slope < -0.05f && DISTI_MAX(ray->f, radius) < 0.05f * tracer->field->radius)
+    if (tells && slope < -0.05f && DISTI_MAX(ray->f, radius) < 0.05f * tracer->detail)
         jump = disti_ray_jump(tracer, ray, told ? -ray->incline : -ray->slope, radius);
     int mode = jump > 0.0f ? DISTI_JUMP : DISTI_MARCH;
     if (jump > 0.0f) step = jump;
@@ -10272,8 +10272,8 @@ static int disti_ray_doubts(const disti_tracer *tracer, const disti_ray *ray, fl
 /* Feels ahead in the band 0 < f < epsilon, farther each time; certified only as far as is proven empty. */
 static int disti_ray_feel(const disti_tracer *tracer, disti_ray *ray, float epsilon)
 {
-    float reach = DISTI_MIN(2.0f * epsilon, 0.01f * tracer->field->radius);
-    for (int i = 0; i < ray->side && reach < 0.01f * tracer->field->radius; i++) reach *= 1.5f;
+    float reach = DISTI_MIN(2.0f * epsilon, 0.01f * tracer->detail);
+    for (int i = 0; i < ray->side && reach < 0.01f * tracer->detail; i++) reach *= 1.5f;
     if (ray->slope < -1e-3f) reach = DISTI_MIN(1.2f * ray->f / -ray->slope, DISTI_MAX(reach, 64.0f * epsilon));
     float q = ray->s + (tracer->how.certified ? disti_empty(tracer, ray->f) : DISTI_MAX(reach, 0.5f * epsilon));
     q = DISTI_MAX(q, ray->s + 4.8e-7f * tracer->field->radius);
@@ -10346,6 +10346,19 @@ static int disti_ray_leasted(const disti_tracer *tracer, disti_ray *ray, float f
     return disti_ray_least(tracer, ray);
 }
 
+/* A certified ray leaves the band by where it came to no more than f's noise: through a sheet thinner than floats can
+   tell, or past a solid nearer than that. That is a hit at the least f, and off by no more
+   than the noise over the mean slope from the last sample well above it. Returns whether it is one. */
+static int disti_ray_sheet(const disti_tracer *tracer, disti_ray *ray)
+{
+    float least = ray->fbest * ray->sign, way = ray->best - ray->crept;
+    if (!(ray->moved && ray->fcrept > 0.0f && way > 0.0f && least <= tracer->noise)) return 0;
+    ray->slope = (least - ray->fcrept) / way;
+    float error = 4.8e-7f * tracer->field->radius - tracer->noise / ray->slope;
+    disti_ray_end(ray, DIST_RAY_HIT, ray->best, least, error);
+    return 1;
+}
+
 /* 0 < f < epsilon at the front: the surface is near, if not hit. Leaving the band again (by 4 epsilon) without a
    crossing was no hit, nor is it the surface that the ray began at. f that does not change at all is a plateau. The
    band's first sample stands in a, fa, the last but one in b, fb. */
@@ -10374,6 +10387,7 @@ static int disti_ray_band(const disti_tracer *tracer, disti_ray *ray, float f)
     ray->f = f;
     ray->slope = slope;
     if (f >= 4.0f * epsilon) {
+        if (tracer->how.certified && disti_ray_sheet(tracer, ray)) return 0;
         ray->known = 1;
         ray->fb = 0.0f; /* the band is over */
         return disti_ray_step(tracer, ray);
@@ -10446,7 +10460,7 @@ static int disti_ray_predicted(const disti_tracer *tracer, disti_ray *ray, float
     float magnitude = f < 0.0f ? -f : f, before = ray->fa < 0.0f ? -ray->fa : ray->fa;
     int far = 2.0f * (float)(ray->base + (double)ray->q) * ray->footprint > 0.01f * tracer->field->radius;
     if (first && fronted && f > 0.0f) before = 0.5f * ray->f; /* the front's: it fell, or it ends elsewhere */
-    int good = slope < -0.05f * tracer->lipschitz && length < 0.03f * tracer->field->radius && magnitude < before &&
+    int good = slope < -0.05f * tracer->lipschitz && length < 0.03f * tracer->detail && magnitude < before &&
                ray->side < 5;
     int ends = f < epsilon || slope < -0.3f * tracer->lipschitz; /* else f may flatten out before it is 0 */
     if (f > 0.0f && slope > -0.12f * tracer->lipschitz) { /* as it does beside an outline */
@@ -10521,6 +10535,7 @@ static int disti_ray_first(const disti_tracer *tracer, disti_ray *ray, float f)
     ray->f = f;
     ray->slope = ray->fa = 0.0f;
     ray->known = 0;
+    disti_ray_creeps(tracer, ray, f, 0);
     if (ray->fb > 0.0f) { /* the second query */
         ray->a = q;
         ray->fa = f;
@@ -10589,10 +10604,12 @@ static int disti_ray_marched(const disti_tracer *tracer, disti_ray *ray, float f
         (ray->side >= 8 || disti_ray_alone(tracer, ray, q, f, ray->b, ray->fb, 2e-3f)))
         return disti_ray_open_bracket(tracer, ray, q, f, ray->b, ray->fb);
     float gap = step - radius - disti_empty(tracer, f < 0.0f ? -f : f); /* what neither sphere covers */
-    int back = ray->mode != DISTI_SKIP && step > 1.0001f * radius + 4.8e-7f * tracer->field->radius;
+    if (tracer->how.certified) gap += 2.0f * tracer->noise / tracer->lipschitz; /* spheres touch at a flat sheet */
+    float sphere = (tracer->how.certified ? 1.0f : 1.0001f) * radius + 4.8e-7f * tracer->field->radius;
+    int back = ray->mode != DISTI_SKIP && step > sphere;
     float off = f - (ray->f + ray->slope * step);
     int foretold = ray->known && (off < 0.0f ? -off : off) < 0.5f * (off - f); /* as deep as expected */
-    float room = (foretold ? 2e-2f : 1e-3f) * tracer->field->radius;
+    float room = (foretold ? 2e-2f : 1e-3f) * tracer->detail;
     if (tracer->how.certified) room = disti_ray_epsilon(tracer, ray, ray->s);
     if (f <= 0.0f && !(back && gap > room)) return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, q, f);
     if (back && (f <= 0.0f || (gap > 0.0f && !disti_ray_trusts(tracer, ray, f, step)))) {

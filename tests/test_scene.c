@@ -1494,6 +1494,63 @@ TEST(only_create_takes_memory_and_a_failed_one_leaves_none)
     CHECK_EQUAL(0, allocator.errors);
 }
 
+/* A thousand balls of a 65th of the scene's radius, smaller than its pixels: what a ray may take on trust goes by the
+   smallest instance, not by the scene. The truth in double; rays that pass an edge by less than 1e-4 do not count. */
+TEST(no_ray_steps_over_an_instance_that_is_small_beside_the_scene)
+{
+    enum { BALLS = 1000, WIDE = 90, HIGH = 70, RAYS = WIDE * HIGH };
+    static dist_instance balls[BALLS];
+    static unsigned char mask[RAYS];
+    static dist_hit hits[RAYS];
+    static float origins[3 * RAYS], directions[3 * RAYS];
+    const double ball = 0.1;
+    float sphere[4] = {0, 0, 0, 0.1f}, eye[3] = {0, 0, 14};
+    dist_context *ctx = shape_context();
+    dist_field field = dist_field_sphere(sphere);
+    test_random random = test_random_seed(7);
+    memset(balls, 0, sizeof balls);
+    for (int i = 0; i < BALLS; i++) {
+        balls[i].field = &field;
+        test_random_fill(&random, 3, balls[i].placement.translation, -4.0f, 4.0f);
+    }
+    dist_scene *scene = dist_scene_create(ctx, BALLS, balls);
+    dist_field all = dist_scene_field(scene);
+    dist_camera camera = dist_camera_look_at(WIDE, HIGH, 0.7f, eye, NULL, NULL);
+    dist_images out;
+    memset(&out, 0, sizeof out);
+    out.mask = mask;
+    CHECK_STATUS(DIST_OK, dist_render(ctx, &all, &camera, NULL, &out, NULL), ctx);
+    for (int i = 0; i < RAYS; i++)
+        dist_camera_ray(&camera, (float)(i % WIDE), (float)(i / WIDE), origins + 3 * i, directions + 3 * i);
+    CHECK_STATUS(DIST_OK, dist_trace(ctx, &all, RAYS, origins, directions, NULL, hits, NULL), ctx);
+    int seen = 0, wrong = 0, wrong_free = 0;
+    for (int i = 0; i < RAYS; i++) {
+        double edge = 1.0, deepest = -1.0;
+        for (int k = 0; k < BALLS; k++) {
+            double along = 0.0, square = 0.0, length = 0.0;
+            for (int j = 0; j < 3; j++) {
+                double v = (double)balls[k].placement.translation[j] - (double)origins[3 * i + j];
+                double d = (double)directions[3 * i + j];
+                along += v * d;
+                square += v * v;
+                length += d * d;
+            }
+            double deep = ball - sqrt(fmax(square - along * along / length, 0.0));
+            edge = fmin(edge, fabs(deep));
+            deepest = fmax(deepest, deep);
+        }
+        if (edge < 1e-4) continue;
+        seen += deepest > 0.0;
+        wrong += mask[i] != (deepest > 0.0);
+        wrong_free += (hits[i].status == DIST_RAY_HIT) != (deepest > 0.0);
+    }
+    CHECK(seen > 1200);
+    CHECK_EQUAL(0, wrong);
+    CHECK_EQUAL(0, wrong_free);
+    dist_scene_destroy(scene);
+    dist_context_destroy(ctx);
+}
+
 int main(int argc, char **argv)
 {
     test_begin(argc, argv);
@@ -1521,5 +1578,6 @@ int main(int argc, char **argv)
     RUN(the_figures_of_an_instance_hold_no_farther_out_in_a_large_scene);
     RUN(a_flat_field_loses_nothing_in_a_scene);
     RUN(only_create_takes_memory_and_a_failed_one_leaves_none);
+    RUN(no_ray_steps_over_an_instance_that_is_small_beside_the_scene);
     return test_report();
 }

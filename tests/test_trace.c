@@ -2218,6 +2218,58 @@ TEST(tiles_go_outward_and_none_is_left_out)
     }
 }
 
+/* The rays through a sheet are known: a box without depth, or with less than floats can tell, has no sample below 0. */
+TEST(no_sheet_is_too_thin_for_a_certified_ray)
+{
+    enum { ROW = 60, RAYS = ROW * ROW };
+    static const float halves[] = {0.0f, 1e-9f, 1e-8f, 1e-7f, 1e-6f, 1e-3f};
+    static float depth[RAYS], origins[3 * RAYS], directions[3 * RAYS];
+    static unsigned char mask[RAYS], through[RAYS];
+    static dist_hit hits[RAYS];
+    dist_context *ctx = shape_context();
+    float eye[3] = {1.6f, 0.5f, 1.5f}, up[3] = {0, 1, 0};
+    dist_camera camera = dist_camera_look_at(ROW, ROW, 0.7f, eye, NULL, up);
+    for (int i = 0; i < RAYS; i++) {
+        float *o = origins + 3 * i, *d = directions + 3 * i;
+        dist_camera_ray(&camera, (float)(i % ROW), (float)(i / ROW), o, d);
+        double t = -(double)o[0] / (double)d[0];
+        double y = (double)o[1] + t * (double)d[1], z = (double)o[2] + t * (double)d[2];
+        through[i] = fabs(y) < 0.4995 && fabs(z) < 0.4995;
+    }
+    for (size_t k = 0; k < sizeof halves / sizeof halves[0]; k++) {
+        float box[6] = {0, 0, 0, halves[k], 0.5f, 0.5f};
+        dist_field field = dist_field_box(box);
+        for (int certified = 0; certified < 2; certified++) {
+            dist_render_desc how;
+            dist_images out;
+            memset(&how, 0, sizeof how);
+            memset(&out, 0, sizeof out);
+            how.certified = certified;
+            out.depth = depth;
+            out.mask = mask;
+            CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+            CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, RAYS, origins, directions, &how, hits, NULL), ctx);
+            int rays = 0, lost = 0, lost_free = 0;
+            double farthest = 0.0;
+            for (int i = 0; i < RAYS; i++) {
+                double t = (-(double)halves[k] * (origins[3 * i] < 0.0f ? 1 : -1) - (double)origins[3 * i]) /
+                           (double)directions[3 * i];
+                if (!through[i]) continue;
+                rays++;
+                lost += !mask[i];
+                lost_free += hits[i].status != DIST_RAY_HIT;
+                double off = fabs((double)hits[i].distance - t);
+                if (off > farthest) farthest = off;
+            }
+            CHECK(rays > 600);
+            CHECK_EQUAL(0, lost);
+            CHECK_EQUAL(0, lost_free);
+            CHECK(farthest < 1e-4);
+        }
+    }
+    dist_context_destroy(ctx);
+}
+
 int main(int argc, char **argv)
 {
     test_begin(argc, argv);
@@ -2275,5 +2327,6 @@ int main(int argc, char **argv)
     RUN(error_bounds_hold_for_999_hits_of_1000_of_real_decoders);
     RUN(depth_of_real_decoders_is_that_of_double);
     RUN(tiles_go_outward_and_none_is_left_out);
+    RUN(no_sheet_is_too_thin_for_a_certified_ray);
     return test_report();
 }

@@ -3242,6 +3242,14 @@ static const int *disti_back_rows(const disti_gemm_back *g, int rows, int n, int
     return k;
 }
 
+#define DISTI_LANES ((int)(sizeof(DISTI_VEC) / sizeof(float)))
+/* These are AVX-512's affair: elsewhere all tiles are the same, and a vector is no more than a panel. */
+#define DISTI_TALL(isa)
+#define DISTI_FEW(isa)
+#define DISTI_DEPTH 112
+#define DISTI_TWO(p, q) ((void)(q), DISTI_LOAD(p))
+#define DISTI_TWO_STORE(p, q, v) (void)(q); DISTI_STORE(p, v);
+
 #ifdef DISTI_X86
 #define DISTI_PREFETCH(p) _mm_prefetch(p, _MM_HINT_T0)
 /* Four vectors of four, scaled: their lanes side by side to four rows. */
@@ -3257,15 +3265,20 @@ static const int *disti_back_rows(const disti_gemm_back *g, int rows, int n, int
         _mm_storeu_ps((to) + 3 * (stride), a3);                                                                        \
     }
 
+/* Of these words the sets differ in the prefix of the intrinsic alone, DISTI_MM. */
+#define DISTI_SET1(s) DISTI_MM(set1_ps)(s)
+#define DISTI_LOAD(p) DISTI_MM(loadu_ps)(p)
+#define DISTI_STORE(p, v) DISTI_MM(storeu_ps)(p, v)
+#define DISTI_ADD(a, b) DISTI_MM(add_ps)(a, b)
+#define DISTI_GREATER(a, b) DISTI_MM(max_ps)(a, b)
+#define DISTI_RELU(v) DISTI_GREATER(DISTI_MM(setzero_ps)(), v)
+#define DISTI_ABS(v) DISTI_MM(andnot_ps)(DISTI_SET1(-0.0f), v)
+#define DISTI_MINUS(v) DISTI_MM(xor_ps)(DISTI_SET1(-0.0f), v)
+
 #define DISTI_FUNCTION DISTI_TARGET("sse2") DISTI_KERNEL static
 #define DISTI_VEC __m128
-#define DISTI_LANES 4
-#define DISTI_SET1(s) _mm_set1_ps(s)
-#define DISTI_LOAD(p) _mm_loadu_ps(p)
-#define DISTI_STORE(p, v) _mm_storeu_ps(p, v)
-#define DISTI_ADD(a, b) _mm_add_ps(a, b)
+#define DISTI_MM(name) _mm_##name
 #define DISTI_FMA(c, a, b) c = _mm_add_ps(_mm_mul_ps(a, b), c)
-#define DISTI_RELU(v) _mm_max_ps(_mm_setzero_ps(), v)
 #define DISTI_POSITIVE(v) (unsigned)_mm_movemask_ps(_mm_cmpnle_ps(v, _mm_setzero_ps()))
 #define DISTI_KEEP(v, bits) disti_keep_sse2(v, (int)((bits) & 0xf))
 DISTI_FUNCTION __m128 disti_keep_sse2(__m128 v, int bits)
@@ -3273,49 +3286,27 @@ DISTI_FUNCTION __m128 disti_keep_sse2(__m128 v, int bits)
     const __m128i lane = _mm_setr_epi32(1, 2, 4, 8);
     return _mm_and_ps(v, _mm_castsi128_ps(_mm_cmpeq_epi32(_mm_and_si128(_mm_set1_epi32(bits), lane), lane)));
 }
-#define DISTI_TALL(isa)
-#define DISTI_FEW(isa)
-#define DISTI_DEPTH 112
-#define DISTI_GREATER(a, b) _mm_max_ps(a, b)
-#define DISTI_ABS(v) _mm_andnot_ps(_mm_set1_ps(-0.0f), v)
-#define DISTI_MINUS(v) _mm_xor_ps(_mm_set1_ps(-0.0f), v)
 #define DISTI_MOST4(q)                                                                                                 \
     q = _mm_max_ps(q, _mm_movehl_ps(q, q));                                                                            \
     return _mm_cvtss_f32(_mm_max_ss(q, _mm_shuffle_ps(q, q, 1)));
 DISTI_FUNCTION float disti_most_sse2(__m128 v) { DISTI_MOST4(v) }
-#define DISTI_TWO(p, q) ((void)(q), DISTI_LOAD(p))
-#define DISTI_TWO_STORE(p, q, v) (void)(q); DISTI_STORE(p, v);
 DISTI_KERNELS(sse2, 4, 2)
 DISTI_FEW_TILE(four_sse2, 4, 2)
-#undef DISTI_ABS
-#undef DISTI_MINUS
-#undef DISTI_GREATER
 #undef DISTI_FUNCTION
 #undef DISTI_VEC
-#undef DISTI_LANES
-#undef DISTI_DEPTH
-#undef DISTI_SET1
-#undef DISTI_LOAD
-#undef DISTI_STORE
-#undef DISTI_ADD
+#undef DISTI_MM
 #undef DISTI_FMA
-#undef DISTI_RELU
 #undef DISTI_POSITIVE
 #undef DISTI_KEEP
 
 #define DISTI_FUNCTION DISTI_TARGET("avx2,fma") DISTI_KERNEL static
 #define DISTI_VEC __m256
-#define DISTI_LANES 8
-#define DISTI_SET1(s) _mm256_set1_ps(s)
-#define DISTI_LOAD(p) _mm256_loadu_ps(p)
-#define DISTI_STORE(p, v) _mm256_storeu_ps(p, v)
-#define DISTI_ADD(a, b) _mm256_add_ps(a, b)
+#define DISTI_MM(name) _mm256_##name
 #ifdef _MSC_VER
 #define DISTI_FMA(c, a, b) c = _mm256_fmadd_ps(a, b, c)
 #else
 #define DISTI_FMA(c, a, b) __asm__("vfmadd231ps %1, %2, %0" : "+x"(c) : "x"(b), "x"(a))
 #endif
-#define DISTI_RELU(v) _mm256_max_ps(_mm256_setzero_ps(), v)
 #define DISTI_POSITIVE(v) (unsigned)_mm256_movemask_ps(_mm256_cmp_ps(v, _mm256_setzero_ps(), _CMP_NLE_UQ))
 #define DISTI_KEEP(v, bits) disti_keep_avx2(v, (int)((bits) & 0xff))
 DISTI_FUNCTION __m256 disti_keep_avx2(__m256 v, int bits)
@@ -3324,10 +3315,6 @@ DISTI_FUNCTION __m256 disti_keep_avx2(__m256 v, int bits)
     const __m256i both = _mm256_and_si256(_mm256_set1_epi32(bits), lane);
     return _mm256_and_ps(v, _mm256_castsi256_ps(_mm256_cmpeq_epi32(both, lane)));
 }
-#define DISTI_DEPTH 112
-#define DISTI_GREATER(a, b) _mm256_max_ps(a, b)
-#define DISTI_ABS(v) _mm256_andnot_ps(_mm256_set1_ps(-0.0f), v)
-#define DISTI_MINUS(v) _mm256_xor_ps(_mm256_set1_ps(-0.0f), v)
 DISTI_FUNCTION float disti_most_avx2(__m256 v)
 {
     __m128 q = _mm_max_ps(_mm256_castps256_ps128(v), _mm256_extractf128_ps(v, 1));
@@ -3346,40 +3333,29 @@ static void disti_few_avx2(const disti_few *g)
     else disti_few_eight_avx2(g);
 }
 static const disti_part disti_parts_avx2[] = {{9, 18, 6}, {25, 30, 24}, {33, 40, 24}, {0, 0, 0}};
-#undef DISTI_ABS
-#undef DISTI_MINUS
 #undef DISTI_GREATER
 #undef DISTI_TWO
 #undef DISTI_TWO_STORE
 #undef DISTI_TALL
 #undef DISTI_FEW
+#undef DISTI_DEPTH
 #undef DISTI_FUNCTION
 #undef DISTI_VEC
-#undef DISTI_LANES
-#undef DISTI_DEPTH
-#undef DISTI_SET1
-#undef DISTI_LOAD
-#undef DISTI_STORE
-#undef DISTI_ADD
+#undef DISTI_MM
 #undef DISTI_FMA
-#undef DISTI_RELU
 #undef DISTI_POSITIVE
 #undef DISTI_KEEP
 
 #define DISTI_FUNCTION DISTI_TARGET("avx512f,avx512bw,avx512dq,avx512vl,fma") DISTI_KERNEL static
 #define DISTI_VEC __m512
-#define DISTI_LANES 16
-#define DISTI_SET1(s) _mm512_set1_ps(s)
-#define DISTI_LOAD(p) _mm512_loadu_ps(p)
-#define DISTI_STORE(p, v) _mm512_storeu_ps(p, v)
-#define DISTI_ADD(a, b) _mm512_add_ps(a, b)
+#define DISTI_MM(name) _mm512_##name
 #ifdef _MSC_VER
 #define DISTI_FMA(c, a, b) c = _mm512_fmadd_ps(a, b, c)
 #else
 #define DISTI_FMA(c, a, b) __asm__("vfmadd231ps %1, %2, %0" : "+v"(c) : "v"(b), "v"(a))
 #endif
 /* Unmasked, gcc 12 warns in C++ that its own header uses an uninitialized variable. */
-#define DISTI_RELU(v) _mm512_maskz_max_ps((__mmask16)0xffff, _mm512_setzero_ps(), v)
+#define DISTI_GREATER(a, b) _mm512_maskz_max_ps((__mmask16)0xffff, a, b)
 #define DISTI_POSITIVE(v) _mm512_cmp_ps_mask(v, _mm512_setzero_ps(), _CMP_NLE_UQ)
 #define DISTI_KEEP(v, bits) _mm512_maskz_mov_ps((__mmask16)((bits) & 0xffff), v)
 #define DISTI_DEPTH 512
@@ -3394,9 +3370,6 @@ DISTI_GEMM_TILE(tall_avx512, 16, 1, DISTI_ABOVE)
         continue;                                                                                                      \
     }
 DISTI_BACK_TILE(few_avx512, 4, 3, DISTI_LISTED)
-#define DISTI_GREATER(a, b) _mm512_maskz_max_ps((__mmask16)0xffff, a, b)
-#define DISTI_ABS(v) _mm512_andnot_ps(_mm512_set1_ps(-0.0f), v)
-#define DISTI_MINUS(v) _mm512_xor_ps(_mm512_set1_ps(-0.0f), v)
 DISTI_FUNCTION float disti_most_avx512(__m512 v)
 {
     const __m256 half = _mm256_max_ps(_mm512_maskz_extractf32x8_ps((__mmask8)0xff, v, 0),
@@ -3427,13 +3400,6 @@ static void disti_few_avx512(const disti_few *g)
 }
 static const disti_part disti_parts_avx512[] = {{13, 24, 12}, {33, 44, 32}, {49, 56, 32},
                                                 {57, 60, 48}, {61, 1 << 30, 32}, {0, 0, 0}};
-#undef DISTI_ABS
-#undef DISTI_MINUS
-#undef DISTI_GREATER
-#undef DISTI_TWO
-#undef DISTI_TWO_STORE
-#undef DISTI_TALL
-#undef DISTI_FEW
 
 #ifdef DISTI_HALF
 /* A hidden layer in 16 bits: f16 by AVX512-FP16, or pairs of inputs by AVX512-BF16, from one text as above. A vector's
@@ -3691,7 +3657,6 @@ DISTI_HALF_KERNEL(bf16)
 
 #define DISTI_FUNCTION DISTI_KERNEL static
 #define DISTI_VEC float32x4_t
-#define DISTI_LANES 4
 #define DISTI_SET1(s) vdupq_n_f32(s)
 #define DISTI_LOAD(p) vld1q_f32(p)
 #define DISTI_STORE(p, v) vst1q_f32(p, v)
@@ -3714,9 +3679,6 @@ static float32x4_t disti_keep_neon(float32x4_t v, uint32_t bits)
     static const uint32_t lane[4] = {1, 2, 4, 8};
     return vreinterpretq_f32_u32(vandq_u32(vreinterpretq_u32_f32(v), vtstq_u32(vdupq_n_u32(bits), vld1q_u32(lane))));
 }
-#define DISTI_TALL(isa)
-#define DISTI_FEW(isa)
-#define DISTI_DEPTH 112
 #define DISTI_GREATER(a, b) vmaxq_f32(a, b)
 #define DISTI_ABS(v) vabsq_f32(v)
 #define DISTI_MINUS(v) vnegq_f32(v)
@@ -3730,15 +3692,8 @@ static float32x4_t disti_keep_neon(float32x4_t v, uint32_t bits)
         vst1q_f32((to) + 3 * (stride), vcombine_f32(vget_high_f32(a.val[1]), vget_high_f32(b.val[1])));                \
     }
 static float disti_most_neon(float32x4_t v) { return vmaxvq_f32(v); }
-#define DISTI_TWO(p, q) ((void)(q), DISTI_LOAD(p))
-#define DISTI_TWO_STORE(p, q, v) (void)(q); DISTI_STORE(p, v);
 DISTI_KERNELS(neon, 8, 3)
 DISTI_FEW_TILE(four_neon, 4, 2)
-#undef DISTI_ABS
-#undef DISTI_MINUS
-#undef DISTI_GREATER
-#undef DISTI_TWO
-#undef DISTI_TWO_STORE
 #endif
 #endif
 
@@ -3894,10 +3849,16 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_FUNCTION
 #undef DISTI_VEC
 #undef DISTI_LANES
+#undef DISTI_MM
 #undef DISTI_SET1
 #undef DISTI_LOAD
 #undef DISTI_STORE
 #undef DISTI_ADD
+#undef DISTI_GREATER
+#undef DISTI_ABS
+#undef DISTI_MINUS
+#undef DISTI_TWO
+#undef DISTI_TWO_STORE
 #undef DISTI_FMA
 #undef DISTI_RELU
 #undef DISTI_POSITIVE

@@ -23,7 +23,7 @@ first=$(grep -n -m 1 -E '^(typedef|enum|struct|DIST_API)' "$work/code" | cut -d 
 
 # Names with a leading or a double underscore belong to the compiler; what we may use of its names is listed.
 # What stands after ## is the end of a name.
-sed 's/##[ ]*_/##x_/g' "$work/code" | grep -n -o -E '[A-Za-z0-9_]+' | grep -E ':(_|[A-Za-z0-9_]*__)' | grep -v -E ':(__cplusplus|_OPENMP|_MSC_VER|_M_[A-Z0-9]+|_WIN(32|64)|__(GNUC|GNUC_MINOR|clang|clang_major|x86_64|i386|aarch64|ARM_NEON|SSE2|OPTIMIZE|FINITE_MATH_ONLY|FLT_EVAL_METHOD|attribute|restrict|asm|has_builtin|has_include|has_attribute|BYTE_ORDER|ORDER_LITTLE_ENDIAN|ORDER_BIG_ENDIAN)(__)?|__builtin_[a-z0-9_]+|_mm(256|512)?_[a-z0-9_]+|_MM_[A-Z_0-9]+|_CMP_[A-Z_]+|__m(128|256|512)[id]?|__mmask(8|16|32|64)|__cpuid(ex|_count|_max)?|_xgetbv|__volatile__|__declspec|__prefetch|__restrict|__inline|_ReadWriteBarrier|__unused__)$' \
+sed 's/##[ ]*_/##x_/g' "$work/code" | grep -n -o -E '[A-Za-z0-9_]+' | grep -E ':(_|[A-Za-z0-9_]*__)' | grep -v -E ':(__cplusplus|_OPENMP|_MSC_VER|_M_[A-Z0-9]+|_WIN(32|64)|__(GNUC|GNUC_MINOR|clang|clang_major|x86_64|i386|aarch64|ARM_NEON|SSE2|OPTIMIZE|FINITE_MATH_ONLY|FLT_EVAL_METHOD|attribute|restrict|asm|has_builtin|has_include|has_attribute|BYTE_ORDER|ORDER_LITTLE_ENDIAN|ORDER_BIG_ENDIAN)(__)?|__builtin_[a-z0-9_]+|_mm(256|512)?_[a-z0-9_]*|_MM_[A-Z_0-9]+|_CMP_[A-Z_]+|__m(128|256|512)[id]?|__mmask(8|16|32|64)|__cpuid(ex|_count|_max)?|_xgetbv|__volatile__|__declspec|__prefetch|__restrict|__inline|_ReadWriteBarrier|__unused__)$' \
     >"$work/found"
 grep -n -E '^[ ]*#[ ]*(define|undef) *(_|[A-Za-z0-9_]*__)' "$work/code" >>"$work/found"
 expect_nothing no_reserved_names "$work/found"

@@ -3710,58 +3710,29 @@ static uint32_t disti_f16_bits(float x) /* not called: dist_net_set_half refuses
 }
 #endif
 
-#define DISTI_TABLE(isa) \
-    kernels.gemm = disti_gemm_##isa; \
-    kernels.gemm_back = disti_gemm_back_##isa; \
-    kernels.gemm_weights = disti_gemm_weights_##isa; \
-    kernels.dot = disti_dot_##isa; \
-    kernels.outer = disti_outer_##isa; \
-    kernels.lanes = disti_lanes_##isa; \
-    kernels.axpy = disti_axpy_##isa; \
-    kernels.rows = disti_rows_##isa; \
-    kernels.points = disti_points_##isa; \
-    kernels.angles = disti_angles_##isa; \
-    kernels.relu = disti_relu_##isa; \
-    kernels.activate = disti_activate_##isa; \
-    kernels.gemm_some = disti_gemm_some_##isa; \
-    kernels.bound = disti_bound_##isa; \
-    kernels.live = disti_live_##isa; \
-    kernels.fit = disti_fit_##isa; \
-    kernels.norm = disti_norm_##isa; \
-    kernels.activate_back = disti_activate_back_##isa; \
-    kernels.norm_back = disti_norm_back_##isa; \
-    kernels.norm_tangents = disti_norm_tangents_##isa; \
-    kernels.activate_tangents = disti_activate_tangents_##isa; \
-    kernels.huge = disti_huge_##isa; \
-    kernels.transpose = disti_transpose_##isa;
+/* In the order of disti_kernels. */
+#define DISTI_TABLE(isa, few, few_points, parts)                                                                       \
+    {disti_gemm_##isa, disti_gemm_some_##isa, few, few_points, parts, disti_bound_##isa, disti_live_##isa,             \
+     disti_fit_##isa, disti_gemm_back_##isa, disti_gemm_weights_##isa, disti_dot_##isa, disti_outer_##isa,             \
+     disti_lanes_##isa, disti_rows_##isa, disti_points_##isa, disti_angles_##isa, disti_axpy_##isa, disti_relu_##isa,  \
+     disti_activate_##isa, disti_activate_back_##isa, disti_norm_##isa, disti_norm_back_##isa,                         \
+     disti_norm_tangents_##isa, disti_activate_tangents_##isa, disti_huge_##isa, disti_transpose_##isa}
 
 /* isa: one that disti_cpu_has */
 static disti_kernels disti_kernels_for(int isa)
 {
-    disti_kernels kernels;
-    DISTI_TABLE(scalar)
-    kernels.few = disti_few_scalar;
-    kernels.few_points = isa == DIST_ISA_SCALAR ? DISTI_FEW_POINTS : 4;
-    kernels.parts = NULL;
 #ifdef DISTI_X86
-    if (isa == DIST_ISA_SSE2) { DISTI_TABLE(sse2) kernels.few = disti_few_four_sse2; }
-    if (isa == DIST_ISA_AVX2) {
-        DISTI_TABLE(avx2)
-        kernels.few = disti_few_avx2;
-        kernels.few_points = 8;
-        kernels.parts = disti_parts_avx2;
-    }
-    if (isa == DIST_ISA_AVX512) {
-        DISTI_TABLE(avx512)
-        kernels.few = disti_few_avx512;
-        kernels.few_points = DISTI_FEW_POINTS;
-        kernels.parts = disti_parts_avx512;
-    }
+    const disti_kernels sse2 = DISTI_TABLE(sse2, disti_few_four_sse2, 4, NULL);
+    const disti_kernels avx2 = DISTI_TABLE(avx2, disti_few_avx2, 8, disti_parts_avx2);
+    const disti_kernels avx512 = DISTI_TABLE(avx512, disti_few_avx512, DISTI_FEW_POINTS, disti_parts_avx512);
+    if (isa != DIST_ISA_SCALAR) return isa == DIST_ISA_SSE2 ? sse2 : isa == DIST_ISA_AVX2 ? avx2 : avx512;
 #endif
 #ifdef DISTI_NEON
-    if (isa == DIST_ISA_NEON) { DISTI_TABLE(neon) kernels.few = disti_few_four_neon; }
+    const disti_kernels neon = DISTI_TABLE(neon, disti_few_four_neon, 4, NULL);
+    if (isa != DIST_ISA_SCALAR) return neon;
 #endif
-    return kernels;
+    const disti_kernels scalar = DISTI_TABLE(scalar, disti_few_scalar, DISTI_FEW_POINTS, NULL);
+    return (void)isa, scalar;
 }
 
 #undef DISTI_NOINLINE

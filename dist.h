@@ -3425,6 +3425,13 @@ typedef struct disti_half {
     int activation, steps, alive_count, point, out, columns, y_alive_count, bad;
 } disti_half;
 
+/* Words besides those above: DISTI_ROWS rows in a step, DISTI_FLUSH1, what becomes of a run's sums, DISTI_NARROW(low,
+   high) of two f32 vectors one of 16 bits; DISTI_SUMS_BEGIN and DISTI_STEPS_BEGIN: where a tile begins with bias and
+   point; DISTI_FINISH: how it may end sooner. From DISTI_ROWS follow DISTI_COLUMNS, points in a row's three vectors,
+   DISTI_SHORT, steps between flushes, and DISTI_SECOND, from the first to the second f32 vector of one of 16 bits. */
+#define DISTI_COLUMNS (2 * DISTI_BLOCK / DISTI_ROWS)
+#define DISTI_SHORT (DISTI_ROWS == 1 ? 128 : 1 << 30)
+#define DISTI_SECOND (DISTI_ROWS == 1 ? 16 : DISTI_COLUMNS)
 #define DISTI_CELL(c) ((c) / DISTI_BLOCK)
 #define DISTI_BAD(v) _mm512_fpclass_ps_mask(v, 0x99) /* NaN, infinity */
 #define DISTI_LAST(from, v)                                                                                            \
@@ -3435,7 +3442,7 @@ typedef struct disti_half {
     DISTI_NOINLINE DISTI_FUNCTION void disti_half_##name(disti_half *g, int o)                                         \
     {                                                                                                                  \
         float sums[8 * DISTI_COLUMNS];                                                                                 \
-        const size_t n = DISTI_WIDEN * V * 16, at = (size_t)(unsigned)o;                                               \
+        const size_t n = V * DISTI_COLUMNS / 3, at = (size_t)(unsigned)o;                                              \
         const int *alive = g->alive, *const alive_end = alive ? alive + g->alive_count : NULL;                         \
         const float *const factors = g->point_weights + at / 8 * g->panel, *const bias = g->bias + at;                 \
         const float *const weights = g->weights + at * (size_t)(unsigned)g->steps;                                     \
@@ -3507,21 +3514,13 @@ typedef struct disti_half {
         }                                                                                                              \
     }
 
-/* Words besides those above: DISTI_COLUMNS points in a row's three vectors, DISTI_WIDEN f32 vectors for one of them,
-   DISTI_ROWS rows in a step, DISTI_SHORT steps between flushes, DISTI_SECOND from the first to the second f32 vector of
-   one of 16 bits, DISTI_NARROW(low, high) the latter; DISTI_SUMS_BEGIN and DISTI_STEPS_BEGIN: where a tile begins with
-   bias and point. */
 #undef DISTI_FUNCTION
 #undef DISTI_FMA
 #define DISTI_FUNCTION DISTI_TARGET("avx512f,avx512bw,avx512dq,avx512vl,fma,avx512fp16") DISTI_KERNEL static
 /* By name also because clang 14's intrinsics are there only where the whole program is built for them. */
 #define DISTI_FMA(c, a, b) __asm__("vfmadd231ph %1, %2, %0" : "+v"(c) : "v"(b), "v"(a))
-#define DISTI_COLUMNS (2 * DISTI_BLOCK)
-#define DISTI_WIDEN 2
 #define DISTI_ROWS 1
-#define DISTI_SHORT 128
 #define DISTI_FLUSH1(i, j) disti_flush_f16(sums + i * DISTI_COLUMNS + j * 32, a##i##j);
-#define DISTI_SECOND 16
 #define DISTI_NARROW(low, high) disti_narrow_f16(low, high)
 #define DISTI_SUMS_BEGIN                                                                                               \
     for (size_t i = 0; i < 8; i++) {                                                                                   \
@@ -3553,23 +3552,15 @@ DISTI_HALF_KERNEL(f16)
 
 #undef DISTI_FUNCTION
 #undef DISTI_FMA
-#undef DISTI_COLUMNS
-#undef DISTI_WIDEN
 #undef DISTI_ROWS
-#undef DISTI_SHORT
 #undef DISTI_FLUSH1
 #undef DISTI_NARROW
-#undef DISTI_SECOND
 #undef DISTI_SUMS_BEGIN
 #undef DISTI_STEPS_BEGIN
 #undef DISTI_FINISH
 #define DISTI_FUNCTION DISTI_TARGET("avx512f,avx512bw,avx512dq,avx512vl,fma,avx512bf16") DISTI_KERNEL static
 #define DISTI_FMA(c, a, b) __asm__("vdpbf16ps %1, %2, %0" : "+v"(c) : "v"(b), "v"(a))
-#define DISTI_COLUMNS DISTI_BLOCK
-#define DISTI_WIDEN 1
 #define DISTI_ROWS 2
-#define DISTI_SHORT (1 << 30)
-#define DISTI_SECOND DISTI_COLUMNS
 #define DISTI_NARROW(low, high) disti_narrow_bf16(low, high)
 #define DISTI_FLUSH1(i, j) _mm512_storeu_ps(sums + i * DISTI_COLUMNS + j * 16, a##i##j);
 #define DISTI_SUMS_BEGIN
@@ -3616,7 +3607,6 @@ DISTI_FUNCTION __m512i disti_narrow_bf16(__m512 low, __m512 high)
     }
 DISTI_HALF_KERNEL(bf16)
 #undef DISTI_COLUMNS
-#undef DISTI_WIDEN
 #undef DISTI_ROWS
 #undef DISTI_SHORT
 #undef DISTI_FLUSH1

@@ -949,17 +949,22 @@ extern "C" {
 #endif
 
 #if defined(__GNUC__) || defined(__clang__)
-#define DISTI_RESTRICT __restrict__
+#define DISTI_RESTRICT __restrict
 #define DISTI_TARGET(isa) __attribute__((target(isa)))
 #define DISTI_UNUSED __attribute__((unused))
-#elif defined(_MSC_VER)
+#define DISTI_INLINE static inline __attribute__((always_inline))
+#define DISTI_NOINLINE __attribute__((noinline))
+#else
+#ifdef _MSC_VER
 #define DISTI_RESTRICT __restrict
-#define DISTI_TARGET(isa)
-#define DISTI_UNUSED
+#define DISTI_NOINLINE __declspec(noinline)
 #else
 #define DISTI_RESTRICT
+#define DISTI_NOINLINE
+#endif
 #define DISTI_TARGET(isa)
 #define DISTI_UNUSED
+#define DISTI_INLINE static inline
 #endif
 /* gcc without optimization makes intrinsics twenty times slower; kernels ask for it themselves. */
 #if defined(__GNUC__) && !defined(__clang__) && !defined(__OPTIMIZE__)
@@ -974,11 +979,6 @@ extern "C" {
 #define DISTI_LOOPS __attribute__((optimize("O3,no-trapping-math,no-math-errno,fp-contract=fast")))
 #else
 #define DISTI_LOOPS
-#endif
-#if defined(__GNUC__) || defined(__clang__)
-#define DISTI_INLINE static inline __attribute__((always_inline))
-#else
-#define DISTI_INLINE static inline
 #endif
 
 #if !defined(DIST_NO_SIMD) && (defined(__x86_64__) || defined(_M_X64)) &&                                              \
@@ -2694,11 +2694,6 @@ DISTI_PLAIN(scalar, static)
    A tile of R rows and V vectors keeps its sums in variables a<row><vector>: gcc holds those in registers where it
    would spill an array. A row's factor is broadcast and serves its V vectors; in the forward pass the factors of a
    tile stand side by side, elsewhere at R offsets k<row>. */
-#ifdef _MSC_VER
-#define DISTI_NOINLINE __declspec(noinline)
-#else
-#define DISTI_NOINLINE __attribute__((noinline))
-#endif
 #define DISTI_X1(M, i) M(i, 0)
 #define DISTI_X2(M, i) M(i, 0) M(i, 1)
 #define DISTI_X3(M, i) M(i, 0) M(i, 1) M(i, 2)

@@ -3298,9 +3298,9 @@ DISTI_FEW_TILE(four_sse2, 4, 2)
 #define DISTI_VEC __m256
 #define DISTI_MM(name) _mm256_##name
 #ifdef _MSC_VER
-#define DISTI_FMA(c, a, b) c = _mm256_fmadd_ps(a, b, c)
+#define DISTI_FMA(c, a, b) c = DISTI_MM(fmadd_ps)(a, b, c)
 #else
-#define DISTI_FMA(c, a, b) __asm__("vfmadd231ps %1, %2, %0" : "+x"(c) : "x"(b), "x"(a))
+#define DISTI_FMA(c, a, b) __asm__("vfmadd231ps %1, %2, %0" : "+v"(c) : "v"(b), "v"(a))
 #endif
 #define DISTI_POSITIVE(v) (unsigned)_mm256_movemask_ps(_mm256_cmp_ps(v, _mm256_setzero_ps(), _CMP_NLE_UQ))
 #define DISTI_KEEP(v, bits) disti_keep_avx2(v, (int)((bits) & 0xff))
@@ -3337,18 +3337,12 @@ static const disti_part disti_parts_avx2[] = {{9, 18, 6}, {25, 30, 24}, {33, 40,
 #undef DISTI_FUNCTION
 #undef DISTI_VEC
 #undef DISTI_MM
-#undef DISTI_FMA
 #undef DISTI_POSITIVE
 #undef DISTI_KEEP
 
 #define DISTI_FUNCTION DISTI_TARGET("avx512f,avx512bw,avx512dq,avx512vl,fma") DISTI_KERNEL static
 #define DISTI_VEC __m512
 #define DISTI_MM(name) _mm512_##name
-#ifdef _MSC_VER
-#define DISTI_FMA(c, a, b) c = _mm512_fmadd_ps(a, b, c)
-#else
-#define DISTI_FMA(c, a, b) __asm__("vfmadd231ps %1, %2, %0" : "+v"(c) : "v"(b), "v"(a))
-#endif
 /* Unmasked, gcc 12 warns in C++ that its own header uses an uninitialized variable. */
 #define DISTI_GREATER(a, b) _mm512_maskz_max_ps((__mmask16)0xffff, a, b)
 #define DISTI_POSITIVE(v) _mm512_cmp_ps_mask(v, _mm512_setzero_ps(), _CMP_NLE_UQ)

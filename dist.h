@@ -2736,7 +2736,7 @@ DISTI_PLAIN(scalar, static)
 #define DISTI_STORE_RELU1(i, j)                                                                                        \
     a##i##j = DISTI_ADD(a##i##j, b);                                                                                   \
     bits |= (uint64_t)DISTI_POSITIVE(a##i##j) << (j * DISTI_LANES);                                                    \
-    DISTI_STORE(y + i * DISTI_BLOCK + j * DISTI_LANES, DISTI_RELU(a##i##j));
+    DISTI_STORE(line + j * DISTI_LANES, DISTI_RELU(a##i##j));
 #define DISTI_STORE_POSITIVE1(i, j) \
     DISTI_STORE(y + i * DISTI_BLOCK + j * DISTI_LANES, DISTI_RELU(DISTI_ADD(a##i##j, b)));
 /* Minus zero becomes zero, so that a zero row left out cannot show in its sign. */
@@ -2748,6 +2748,7 @@ DISTI_PLAIN(scalar, static)
 #define DISTI_STORE_RELU(i, V)                                                                                         \
     {                                                                                                                  \
         const DISTI_VEC b = DISTI_SET1(bias[i]);                                                                       \
+        float *const line = y + i * DISTI_BLOCK;                                                                       \
         uint64_t bits = 0;                                                                                             \
         DISTI_X##V(DISTI_STORE_RELU1, i)                                                                               \
         mask[i] |= bits << c;                                                                                          \
@@ -2810,16 +2811,12 @@ DISTI_PLAIN(scalar, static)
 
 /* As above for outputs that stand in a list, with ReLU: o; from `count` on they repeat the last one. */
 #define DISTI_PLACE(i, V) const size_t k##i = (size_t)(unsigned)(o[i] >> 3) * panel + (size_t)(unsigned)(o[i] & 7);
-#define DISTI_SOME_STORE1(i, j)                                                                                        \
-    a##i##j = DISTI_ADD(a##i##j, b);                                                                                   \
-    bits |= (uint64_t)DISTI_POSITIVE(a##i##j) << (j * DISTI_LANES);                                                    \
-    DISTI_STORE(y + j * DISTI_LANES, DISTI_RELU(a##i##j));
 #define DISTI_SOME_STORE(i, V)                                                                                         \
     if (i < count) {                                                                                                   \
         const DISTI_VEC b = DISTI_SET1(g->bias[o[i]]);                                                                 \
         uint64_t bits = 0;                                                                                             \
-        float *y = g->y + (size_t)(unsigned)o[i] * DISTI_BLOCK + c;                                                    \
-        DISTI_X##V(DISTI_SOME_STORE1, i)                                                                               \
+        float *const line = g->y + (size_t)(unsigned)o[i] * DISTI_BLOCK + c;                                           \
+        DISTI_X##V(DISTI_STORE_RELU1, i)                                                                               \
         g->mask[o[i]] |= bits << c;                                                                                    \
     }
 #define DISTI_SOME_TILE(name, R, V)                                                                                    \
@@ -3775,7 +3772,6 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_DRIVERS
 #undef DISTI_KERNELS
 #undef DISTI_PLACE
-#undef DISTI_SOME_STORE1
 #undef DISTI_SOME_STORE
 #undef DISTI_SOME_TILE
 #undef DISTI_FEW_X

@@ -4588,11 +4588,6 @@ static dist_status disti_code_begin(dist_context *ctx, const dist_field *field, 
     return status;
 }
 
-static void disti_code_end(const dist_field *field, const dist_gradients *grads, const double *d_code)
-{
-    for (size_t j = 0; d_code && j < (size_t)field->code_size; j++) disti_add_gradient(&grads->code[j], d_code[j]);
-}
-
 /* name: of the function that failures are told of. */
 static dist_status disti_field_backward(dist_context *ctx, const char *name, const dist_field *field, size_t n,
                                         const float *points, float *d_sdf, dist_seed_fn seed_fn, void *seed_user,
@@ -4614,7 +4609,7 @@ static dist_status disti_field_backward(dist_context *ctx, const char *name, con
                                    grads->weights);
     else
         disti_field_backward_all(ctx, field, n, points, d_sdf, seed_fn, seed_user, d_points, d_code);
-    if (status == DIST_OK) disti_code_end(field, grads, d_code);
+    if (status == DIST_OK) disti_codes_add(field, grads, d_code);
     return status;
 }
 
@@ -4668,7 +4663,7 @@ DIST_API dist_status dist_field_eikonal(dist_context *ctx, const dist_field *fie
                                         d_code, grads->weights);
     }
     if (status == DIST_OK && loss) *loss = (float)((double)weight * sum / (double)n);
-    if (status == DIST_OK && grads) disti_code_end(field, grads, d_code);
+    if (status == DIST_OK && grads) disti_codes_add(field, grads, d_code);
     return status;
 }
 #endif

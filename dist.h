@@ -3411,10 +3411,10 @@ typedef struct disti_half {
     int activation, steps, alive_count, point, out, columns, y_alive_count, bad;
 } disti_half;
 
-/* Words besides those above: DISTI_ROWS rows in a step, DISTI_FLUSH1, what becomes of a run's sums, DISTI_NARROW(low,
-   high) of two f32 vectors one of 16 bits; DISTI_SUMS_BEGIN and DISTI_STEPS_BEGIN: where a tile begins with bias and
-   point; DISTI_FINISH: how it may end sooner. From DISTI_ROWS follow DISTI_COLUMNS, points in a row's three vectors,
-   DISTI_SHORT, steps between flushes, and DISTI_SECOND, from the first to the second f32 vector of one of 16 bits. */
+/* Words besides those above: DISTI_ROWS rows in a step; DISTI_STEPS_BEGIN, how a run's sums begin (of bf16 with bias
+   and point, with which those of an f16 tile begin); DISTI_FLUSH1, what becomes of them; DISTI_FINISH, how a tile may
+   end sooner. From DISTI_ROWS follow DISTI_COLUMNS, points in a row's three vectors, DISTI_SHORT, steps between
+   flushes, and DISTI_SECOND, from the first to the second f32 vector of one of 16 bits, which disti_narrow_ makes. */
 #define DISTI_COLUMNS (2 * DISTI_BLOCK / DISTI_ROWS)
 #define DISTI_SHORT (DISTI_ROWS == 1 ? 128 : 1 << 30)
 #define DISTI_SECOND (DISTI_ROWS == 1 ? 16 : DISTI_COLUMNS)
@@ -3424,15 +3424,24 @@ typedef struct disti_half {
     _mm512_storeu_ps(g->last[DISTI_CELL((from) % DISTI_COLUMNS)] +                                                     \
                          (at + (from) / DISTI_COLUMNS) * DISTI_BLOCK + (from) % DISTI_COLUMNS % DISTI_BLOCK, v)
 #define DISTI_FLUSH(i, V) DISTI_X##V(DISTI_FLUSH1, i)
-#define DISTI_HALF_TILE(name, V)                                                                                       \
-    DISTI_NOINLINE DISTI_FUNCTION void disti_half_##name(disti_half *g, int o)                                         \
+#define DISTI_HALF_TILE(kind, width, V)                                                                                \
+    DISTI_NOINLINE DISTI_FUNCTION void disti_half_##width##_##kind(disti_half *g, int o)                               \
     {                                                                                                                  \
         float sums[8 * DISTI_COLUMNS];                                                                                 \
         const size_t n = V * DISTI_COLUMNS / 3, at = (size_t)(unsigned)o;                                              \
         const int *alive = g->alive, *const alive_end = alive ? alive + g->alive_count : NULL;                         \
         const float *const factors = g->point_weights + at / 8 * g->panel, *const bias = g->bias + at;                 \
         const float *const weights = g->weights + at * (size_t)(unsigned)g->steps;                                     \
-        DISTI_SUMS_BEGIN                                                                                               \
+        for (size_t i = 0; i < 8 && DISTI_ROWS == 1; i++) {                                                            \
+            for (size_t c = 0; c < n; c += 16) {                                                                       \
+                const float *p = g->points[DISTI_CELL(c)] + c % DISTI_BLOCK;                                           \
+                __m512 sum = _mm512_set1_ps(bias[i]);                                                                  \
+                for (size_t j = 0; j < (size_t)(unsigned)g->point; j++)                                                \
+                    sum = _mm512_fmadd_ps(_mm512_set1_ps(factors[j * 8 + i]), _mm512_loadu_ps(p + j * DISTI_BLOCK),    \
+                                          sum);                                                                        \
+                _mm512_storeu_ps(sums + i * DISTI_COLUMNS + c, sum);                                                   \
+            }                                                                                                          \
+        }                                                                                                              \
         int to = 0;                                                                                                    \
         do {                                                                                                           \
             const float *w = weights + (size_t)(unsigned)to * 8, *x = g->x + (size_t)(unsigned)to * DISTI_BLOCK;       \
@@ -3476,7 +3485,7 @@ typedef struct disti_half {
                     DISTI_LAST(from + DISTI_SECOND, high);                                                             \
                     continue;                                                                                          \
                 }                                                                                                      \
-                const __m512i v = DISTI_NARROW(low, high);                                                             \
+                const __m512i v = disti_narrow_##kind(low, high);                                                      \
                 any = _mm512_or_si512(any, v);                                                                         \
                 _mm512_storeu_si512((void *)(y + j * 16), v);                                                          \
             }                                                                                                          \
@@ -3487,9 +3496,9 @@ typedef struct disti_half {
         g->bad |= bad;                                                                                                 \
     }
 #define DISTI_HALF_KERNEL(kind)                                                                                        \
-    DISTI_HALF_TILE(wide_##kind, 3)                                                                                    \
-    DISTI_HALF_TILE(middle_##kind, 2)                                                                                  \
-    DISTI_HALF_TILE(narrow_##kind, 1)                                                                                  \
+    DISTI_HALF_TILE(kind, wide, 3)                                                                                     \
+    DISTI_HALF_TILE(kind, middle, 2)                                                                                   \
+    DISTI_HALF_TILE(kind, narrow, 1)                                                                                   \
     DISTI_FUNCTION void disti_half_##kind(disti_half *g)                                                               \
     {                                                                                                                  \
         const int vectors = (g->columns * 3 + DISTI_COLUMNS - 1) / DISTI_COLUMNS;                                      \
@@ -3507,17 +3516,6 @@ typedef struct disti_half {
 #define DISTI_FMA(c, a, b) __asm__("vfmadd231ph %1, %2, %0" : "+v"(c) : "v"(b), "v"(a))
 #define DISTI_ROWS 1
 #define DISTI_FLUSH1(i, j) disti_flush_f16(sums + i * DISTI_COLUMNS + j * 32, a##i##j);
-#define DISTI_NARROW(low, high) disti_narrow_f16(low, high)
-#define DISTI_SUMS_BEGIN                                                                                               \
-    for (size_t i = 0; i < 8; i++) {                                                                                   \
-        for (size_t c = 0; c < n; c += 16) {                                                                           \
-            const float *p = g->points[DISTI_CELL(c)] + c % DISTI_BLOCK;                                               \
-            __m512 sum = _mm512_set1_ps(bias[i]);                                                                      \
-            for (size_t j = 0; j < (size_t)(unsigned)g->point; j++)                                                    \
-                sum = _mm512_fmadd_ps(_mm512_set1_ps(factors[j * 8 + i]), _mm512_loadu_ps(p + j * DISTI_BLOCK), sum);  \
-            _mm512_storeu_ps(sums + i * DISTI_COLUMNS + c, sum);                                                       \
-        }                                                                                                              \
-    }
 #define DISTI_STEPS_BEGIN(V) DISTI_Y8(DISTI_ZERO, V)
 #define DISTI_FINISH(V)
 DISTI_FUNCTION void disti_flush_f16(float *sum, __m512 v)
@@ -3540,16 +3538,12 @@ DISTI_HALF_KERNEL(f16)
 #undef DISTI_FMA
 #undef DISTI_ROWS
 #undef DISTI_FLUSH1
-#undef DISTI_NARROW
-#undef DISTI_SUMS_BEGIN
 #undef DISTI_STEPS_BEGIN
 #undef DISTI_FINISH
 #define DISTI_FUNCTION DISTI_TARGET("avx512f,avx512bw,avx512dq,avx512vl,fma,avx512bf16") DISTI_KERNEL static
 #define DISTI_FMA(c, a, b) __asm__("vdpbf16ps %1, %2, %0" : "+v"(c) : "v"(b), "v"(a))
 #define DISTI_ROWS 2
-#define DISTI_NARROW(low, high) disti_narrow_bf16(low, high)
 #define DISTI_FLUSH1(i, j) _mm512_storeu_ps(sums + i * DISTI_COLUMNS + j * 16, a##i##j);
-#define DISTI_SUMS_BEGIN
 #define DISTI_BIAS1(i, j) __m512 a##i##j = b##i;
 #define DISTI_BIAS(i, V) const __m512 b##i = _mm512_set1_ps(bias[i]); DISTI_X##V(DISTI_BIAS1, i)
 #define DISTI_MAC32(i, j) __asm__("vfmadd231ps %1, %2, %0" : "+v"(a##i##j) : "v"(x##j), "v"(b));
@@ -3596,9 +3590,7 @@ DISTI_HALF_KERNEL(bf16)
 #undef DISTI_ROWS
 #undef DISTI_SHORT
 #undef DISTI_FLUSH1
-#undef DISTI_NARROW
 #undef DISTI_SECOND
-#undef DISTI_SUMS_BEGIN
 #undef DISTI_STEPS_BEGIN
 #undef DISTI_FINISH
 #undef DISTI_BIAS1

@@ -1443,22 +1443,15 @@ static int disti_cpu_half(int kind)
 
 static int disti_cpu_best(void)
 {
-    if (disti_cpu_has(DIST_ISA_AVX512)) return DIST_ISA_AVX512;
-    if (disti_cpu_has(DIST_ISA_AVX2)) return DIST_ISA_AVX2;
-    if (disti_cpu_has(DIST_ISA_SSE2)) return DIST_ISA_SSE2;
-    return disti_cpu_has(DIST_ISA_NEON) ? DIST_ISA_NEON : DIST_ISA_SCALAR;
+    int isa = DIST_ISA_NEON; /* the later the better, down to scalar */
+    while (!disti_cpu_has(isa)) isa--;
+    return isa;
 }
 
 DIST_API const char *dist_isa_name(int isa)
 {
-    switch (isa) {
-    case DIST_ISA_SCALAR: return "scalar";
-    case DIST_ISA_SSE2: return "sse2";
-    case DIST_ISA_AVX2: return "avx2";
-    case DIST_ISA_AVX512: return "avx512";
-    case DIST_ISA_NEON: return "neon";
-    }
-    return "auto";
+    const char *const names[] = {"auto", "scalar", "sse2", "avx2", "avx512", "neon"};
+    return names[isa >= DIST_ISA_AUTO && isa <= DIST_ISA_NEON ? isa : DIST_ISA_AUTO];
 }
 
 #if defined(DISTI_X86)

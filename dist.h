@@ -2623,50 +2623,32 @@ DISTI_INLINE void disti_angles(double base, int levels, const float *DISTI_RESTR
 /* These of a block from the same text for every instruction set; scalar is the definition, as above. */
 #define DISTI_PLAIN(isa, function)                                                                                     \
     function void disti_activate_##isa(int activation, float scale, size_t n, float *y, float *slope)                  \
-    {                                                                                                                  \
-        disti_activate(activation, scale, n, y, slope);                                                                \
-    }                                                                                                                  \
+    { disti_activate(activation, scale, n, y, slope); }                                                                \
     function void disti_norm_##isa(int units, float epsilon, const float *gamma, const float *beta, float *x,          \
                                     float *hat, float *inverse)                                                        \
-    {                                                                                                                  \
-        disti_norm_lanes(units, DISTI_BLOCK, epsilon, gamma, beta, x, hat, inverse);                                   \
-    }                                                                                                                  \
+    { disti_norm_lanes(units, DISTI_BLOCK, epsilon, gamma, beta, x, hat, inverse); }                                   \
     function void disti_activate_back_##isa(size_t n, size_t half, const float *slope, float *d)                       \
-    {                                                                                                                  \
-        disti_activate_backward(n, half, slope, d);                                                                    \
-    }                                                                                                                  \
+    { disti_activate_backward(n, half, slope, d); }                                                                    \
     function void disti_norm_tangents_##isa(int units, float epsilon, const float *gamma, const float *beta, float *x, \
                                              float *hat, float *inverse)                                               \
-    {                                                                                                                  \
-        disti_norm_tangent_lanes(units, epsilon, gamma, beta, x, hat, inverse);                                        \
-    }                                                                                                                  \
+    { disti_norm_tangent_lanes(units, epsilon, gamma, beta, x, hat, inverse); }                                        \
     function void disti_activate_tangents_##isa(int activation, float scale, size_t n, float *y, float *slope,         \
                                                  uint64_t *mask)                                                       \
-    {                                                                                                                  \
-        disti_activate_tangents(activation, scale, n, y, slope, mask);                                                 \
-    }                                                                                                                  \
+    { disti_activate_tangents(activation, scale, n, y, slope, mask); }                                                 \
     function int disti_huge_##isa(size_t n, const float *x) { return disti_huge_any(n, x); }                           \
     function void disti_norm_back_##isa(int units, const float *gamma, size_t half, const float *hat,                  \
                                          const float *inverse, float *d)                                               \
-    {                                                                                                                  \
-        disti_norm_backward(units, gamma, half, hat, inverse, d);                                                      \
-    }                                                                                                                  \
+    { disti_norm_backward(units, gamma, half, hat, inverse, d); }                                                      \
     function void disti_rows_##isa(const float *points, float *rows) { disti_rows(points, rows); }                     \
     function void disti_points_##isa(const float *rows, float *points) { disti_points(rows, points); }                 \
     function void disti_angles_##isa(double base, int levels, const float *x, size_t stride, float *sines,             \
                                       float *cosines)                                                                  \
-    {                                                                                                                  \
-        disti_angles(base, levels, x, stride, sines, cosines);                                                         \
-    }                                                                                                                  \
+    { disti_angles(base, levels, x, stride, sines, cosines); }                                                         \
     function void disti_axpy_##isa(size_t n, double s, const float *x, double *y)                                      \
-    {                                                                                                                  \
-        disti_axpy(n, s, x, y);                                                                                        \
-    }                                                                                                                  \
+    { disti_axpy(n, s, x, y); }                                                                                        \
     function void disti_live_##isa(size_t out, const float *sum, size_t stride, const float *bias, float slack,        \
                                     const float *cell, int *live)                                                      \
-    {                                                                                                                  \
-        disti_live(out, sum, stride, bias, slack, cell, live);                                                         \
-    }
+    { disti_live(out, sum, stride, bias, slack, cell, live); }
 DISTI_PLAIN(scalar, static)
 
 #if defined(DISTI_X86) || defined(DISTI_NEON)

@@ -7714,19 +7714,6 @@ typedef struct disti_weights_job {
     int blocks;
 } disti_weights_job;
 
-static disti_weights_job disti_weights_begin(const dist_shape *shape, size_t n, const float *points, float *d_points,
-                                             float *d_weights)
-{
-    disti_weights_job job;
-    memset(&job, 0, sizeof job);
-    job.shape = shape;
-    job.n = n;
-    job.points = points;
-    job.d_points = d_points;
-    job.d_weights = d_weights;
-    return job;
-}
-
 /* Whether a number of a block's store is so large that products with others may overflow. */
 static int disti_weights_huge(const dist_shape *shape, size_t columns, size_t channels, const float *store)
 {
@@ -7941,10 +7928,8 @@ static dist_status disti_shape_weights_fn(void *user, dist_context *ctx, size_t 
                                           dist_seed_fn seed_fn, void *seed_user, float *d_points, double *d_code,
                                           float *d_weights)
 {
-    disti_weights_job job = disti_weights_begin((const dist_shape *)user, n, points, d_points, d_weights);
-    job.d_sdf = d_sdf;
-    job.seed_fn = seed_fn;
-    job.seed_user = seed_user;
+    disti_weights_job job = {(const dist_shape *)user, n, points, NULL, NULL, d_sdf, seed_fn, seed_user, d_points, NULL,
+                             d_weights, 0, 0, 0};
     disti_weights_run(&job, ctx, d_code);
     return DIST_OK;
 }
@@ -7954,8 +7939,8 @@ static dist_status disti_shape_second_weights(void *user, dist_context *ctx, siz
                                               const float *directions, float *d_points, double *d_code,
                                               float *d_weights)
 {
-    disti_weights_job job = disti_weights_begin((const dist_shape *)user, n, points, d_points, d_weights);
-    job.directions = directions;
+    disti_weights_job job = {(const dist_shape *)user, n, points, NULL, directions, NULL, NULL, NULL, d_points, NULL,
+                             d_weights, 0, 0, 0};
     disti_weights_run(&job, ctx, d_code);
     return DIST_OK;
 }
@@ -7964,8 +7949,8 @@ static dist_status disti_shape_second_weights(void *user, dist_context *ctx, siz
 static void disti_shape_color_weights_fn(void *user, dist_context *ctx, size_t n, const float *points,
                                          const float *d_color, float *d_points, double *d_code, float *d_weights)
 {
-    disti_weights_job job = disti_weights_begin(disti_shape_paint(user), n, points, d_points, d_weights);
-    job.d_color = d_color;
+    disti_weights_job job = {disti_shape_paint(user), n, points, d_color, NULL, NULL, NULL, NULL, d_points, NULL,
+                             d_weights, 0, 0, 0};
     disti_weights_run(&job, ctx, d_code);
 }
 #endif

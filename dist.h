@@ -7819,22 +7819,16 @@ static void disti_weights_block(void *arg, int index, int worker)
 
 enum { DISTI_WEIGHT_ROWS = 64 }; /* outputs of one task of the second phase */
 
-/* The channels that a job is about: of the last layer's rows only theirs get a gradient. */
-static int disti_weights_channel(const disti_weights_job *job)
-{
-    return job->d_color ? job->shape->net->color_channel : job->shape->net->sdf_channel;
-}
-
-/* Adds one block's share to `count` rows of layer l from row `o`, counted from the job's channel in the last layer;
-   but for the code's columns: total gets the sums of the rows' deltas. */
-static void disti_weights_rows(const disti_weights_job *job, int l, size_t o, size_t count, int index, double *total)
+/* Adds one block's share to `count` rows of layer l from `row`, the store's from `o`; but for the code's columns: total
+   gets the sums of the rows' deltas. */
+static void disti_weights_rows(const disti_weights_job *job, int l, size_t o, size_t row, size_t count, int index,
+                               double *total)
 {
     const dist_shape *shape = job->shape;
     const dist_net *net = shape->net;
     const disti_linear *layer = &net->layer[l];
     const float *store = shape->ctx->store + (size_t)index * shape->store_block_size;
     const float *xt = store + disti_store_offset(net, l, DISTI_STORE_INPUT);
-    size_t row = l + 1 == net->layers ? (size_t)disti_weights_channel(job) : o;
     size_t values = DISTI_MIN(job->n - job->first - (size_t)index * job->block, job->block);
     float *w = job->d_weights + layer->weight + row * (size_t)layer->in, ones[16], sum[DISTI_WEIGHT_ROWS];
     disti_gemm_weights g;
@@ -7887,11 +7881,11 @@ static void disti_weights_task(void *arg, int index, int worker)
     }
     const disti_linear *layer = &net->layer[l];
     size_t out = l + 1 < net->layers ? (size_t)layer->out : job->d_color ? 3 : 1;
-    size_t count = DISTI_MIN((size_t)DISTI_WEIGHT_ROWS, out - o);
-    size_t row = l + 1 == net->layers ? (size_t)disti_weights_channel(job) : o;
+    size_t count = DISTI_MIN((size_t)DISTI_WEIGHT_ROWS, out - o), row = o;
+    if (l + 1 == net->layers) row = (size_t)(job->d_color ? net->color_channel : net->sdf_channel); /* only theirs */
     double total[DISTI_WEIGHT_ROWS];
     memset(total, 0, sizeof total);
-    for (int i = 0; i < job->blocks; i++) disti_weights_rows(job, l, o, count, i, total);
+    for (int i = 0; i < job->blocks; i++) disti_weights_rows(job, l, o, row, count, i, total);
     for (size_t i = 0; i < count; i++) {
         float *to = job->d_weights + layer->weight + (row + i) * (size_t)layer->in + layer->code_column;
         for (size_t j = 0; j < (size_t)layer->code; j++)

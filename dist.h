@@ -7714,33 +7714,16 @@ typedef struct disti_weights_job {
     int blocks;
 } disti_weights_job;
 
-/* Whether a number of a block's store is so large that products with others may overflow. */
-static int disti_weights_huge(const dist_shape *shape, size_t columns, size_t channels, const float *store)
-{
-    const dist_net *net = shape->net;
-    int huge = 0;
-    for (int l = 0; l < net->layers && !huge; l++) {
-        const disti_linear *layer = &net->layer[l];
-        size_t rows = l + 1 == net->layers ? channels : (size_t)layer->out;
-        const float *input = store + disti_store_offset(net, l, DISTI_STORE_INPUT);
-        const float *delta = store + disti_store_offset(net, l, DISTI_STORE_DELTA);
-        const float *norm = store + disti_store_offset(net, l, DISTI_STORE_NORM);
-        huge = shape->kernels.huge(columns * disti_store_stride(layer), input) ||
-               shape->kernels.huge(rows * DISTI_BLOCK, delta) ||
-               shape->kernels.huge(net->normed ? 2 * disti_store_out(layer) : 0, norm);
-    }
-    return huge;
-}
-
 /* Points whose numbers somewhere in the net are so large that their products overflow give no weight gradient, rather
    than spoil that of all the others: their inputs and deltas in the store become 0. channels: the store's of the last
-   layer. */
-static void disti_weights_drop(const dist_net *net, size_t columns, size_t channels, float *store)
+   layer. The first pass asks whether there is such a number at all, the second marks points, the third clears them. */
+static void disti_weights_drop(const dist_shape *shape, size_t columns, size_t channels, float *store)
 {
+    const dist_net *net = shape->net;
     unsigned char bad[DISTI_BLOCK];
-    int any = 0;
+    int huge = 0;
     memset(bad, 0, sizeof bad);
-    for (int pass = 0; pass < 1 + any; pass++) {
+    for (int pass = 0; pass < 1 + 2 * huge; pass++) {
         for (int l = 0; l < net->layers; l++) {
             const disti_linear *layer = &net->layer[l];
             size_t rows = l + 1 == net->layers ? channels : (size_t)layer->out;
@@ -7748,20 +7731,25 @@ static void disti_weights_drop(const dist_net *net, size_t columns, size_t chann
             float *xt = store + disti_store_offset(net, l, DISTI_STORE_INPUT);
             float *delta = store + disti_store_offset(net, l, DISTI_STORE_DELTA);
             float *sums = store + disti_store_offset(net, l, DISTI_STORE_NORM);
+            size_t sum_count = net->normed ? 2 * disti_store_out(layer) : 0;
+            if (pass == 0) {
+                huge = huge || shape->kernels.huge(columns * disti_store_stride(layer), xt) ||
+                       shape->kernels.huge(rows * DISTI_BLOCK, delta) || shape->kernels.huge(sum_count, sums);
+                continue;
+            }
             for (size_t c = 0; c < columns; c++) {
                 float *x = xt + c * disti_store_stride(layer);
                 for (size_t k = 0; k < wide; k++)
-                    if (pass && bad[c]) x[k] = 0.0f;
+                    if (pass == 2 && bad[c]) x[k] = 0.0f;
                     else bad[c] |= disti_is_huge(x[k]);
             }
             for (size_t o = 0; o < rows; o++)
                 for (size_t c = 0; c < columns; c++)
-                    if (pass && bad[c]) delta[o * DISTI_BLOCK + c] = 0.0f;
+                    if (pass == 2 && bad[c]) delta[o * DISTI_BLOCK + c] = 0.0f;
                     else bad[c] |= disti_is_huge(delta[o * DISTI_BLOCK + c]);
-            for (size_t i = 0; i < 2 * disti_store_out(layer) && net->normed && l + 1 < net->layers; i++)
+            for (size_t i = 0; i < sum_count; i++)
                 if (disti_is_huge(sums[i])) sums[i] = 0.0f;
         }
-        for (size_t c = 0; c < columns; c++) any |= bad[c];
     }
 }
 
@@ -7807,8 +7795,7 @@ static void disti_weights_block(void *arg, int index, int worker)
         disti_encode_backward(shape, &b, b.pull);
     }
     size_t columns = job->directions ? (size_t)DISTI_BLOCK : count, channels = job->d_color ? 3 : 1;
-    if (disti_weights_huge(shape, columns, channels, store))
-        disti_weights_drop(net, columns, channels, store);
+    disti_weights_drop(shape, columns, channels, store);
     for (size_t i = 0; job->d_points && i < 3 * count; i++)
         if (disti_finite(b.pull[i])) job->d_points[3 * at + i] += b.pull[i];
     if (!job->d_code) return;

@@ -6724,29 +6724,26 @@ static void disti_hidden_delta(const dist_shape *shape, const disti_block *b, in
     const dist_net *net = shape->net;
     const disti_linear *layer = &net->layer[l];
     size_t width = (size_t)net->max_rows, out = (size_t)layer->out;
-    if (net->activation == DIST_ACTIVATION_RELU && !net->normed) return;
+    const uint64_t *mask = b->mask + (size_t)(l + 1) * width;
     if (b->slope) shape->kernels.activate_back(out, (size_t)b->half, b->slope + (size_t)l * width * DISTI_BLOCK, delta);
-    if (net->normed) {
-        const uint64_t *mask = b->mask + (size_t)(l + 1) * width; /* rows that are not alive were not written */
-        if (net->activation == DIST_ACTIVATION_RELU)
-            for (size_t u = 0; u < out; u++)
-                if (!mask[u]) memset(delta + u * DISTI_BLOCK, 0, DISTI_BLOCK * sizeof(float));
-        const float *hat = b->hat + (size_t)l * width * DISTI_BLOCK;
-        for (size_t u = 0; sums && u < out; u++) {
-            sums[u] = sums[disti_store_out(layer) + u] = 0.0f;
-            for (size_t c = 0; c < (size_t)b->columns; c++) {
-                sums[u] += delta[u * DISTI_BLOCK + c] * hat[u * DISTI_BLOCK + c];
-                if (!b->half || c < (size_t)b->half)
-                    sums[disti_store_out(layer) + u] += delta[u * DISTI_BLOCK + c];
-            }
+    if (net->activation == DIST_ACTIVATION_RELU && (net->normed || disti_use_blas(shape, l)))
+        for (size_t u = 0; u < out; u++) /* rows that are not alive were not written, but are read */
+            if (!mask[u]) memset(delta + u * DISTI_BLOCK, 0, DISTI_BLOCK * sizeof(float));
+    if (!net->normed) return;
+    const float *hat = b->hat + (size_t)l * width * DISTI_BLOCK;
+    for (size_t u = 0; sums && u < out; u++) {
+        sums[u] = sums[disti_store_out(layer) + u] = 0.0f;
+        for (size_t c = 0; c < (size_t)b->columns; c++) {
+            sums[u] += delta[u * DISTI_BLOCK + c] * hat[u * DISTI_BLOCK + c];
+            if (!b->half || c < (size_t)b->half) sums[disti_store_out(layer) + u] += delta[u * DISTI_BLOCK + c];
         }
-        shape->kernels.norm_back(layer->out, net->params + layer->norm_weight, (size_t)b->half, hat,
-                                b->inverse + (size_t)l * DISTI_BLOCK, delta);
     }
+    shape->kernels.norm_back(layer->out, net->params + layer->norm_weight, (size_t)b->half, hat,
+                             b->inverse + (size_t)l * DISTI_BLOCK, delta);
 }
 
 /* delta of layer l's pre-activation to its input rows d_x: W^T delta, masked. */
-static void disti_linear_backward(const dist_shape *shape, const disti_block *b, int l, float *delta, float *d_x)
+static void disti_linear_backward(const dist_shape *shape, const disti_block *b, int l, const float *delta, float *d_x)
 {
     const dist_net *net = shape->net;
     const disti_linear *layer = &net->layer[l];
@@ -6760,11 +6757,6 @@ static void disti_linear_backward(const dist_shape *shape, const disti_block *b,
     if (disti_use_blas(shape, l)) {
         const dist_blas *blas = &shape->ctx->blas;
         const float *w = net->params + layer->weight;
-        if (relu && !net->normed) { /* rows that no kernel wrote are zero for a BLAS */
-            const uint64_t *mine = b->mask + (size_t)(l + 1) * width;
-            for (size_t u = 0; u < (size_t)layer->out; u++)
-                if (!mine[u]) memset(delta + u * DISTI_BLOCK, 0, DISTI_BLOCK * sizeof(float));
-        }
         blas->sgemm_fn(blas->user, 1, 0, layer->prev, DISTI_BLOCK, layer->out, layer->scale, w + layer->x_column,
                        layer->in, delta, DISTI_BLOCK, 0.0f, d_x, DISTI_BLOCK);
         if (layer->point > 0)

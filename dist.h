@@ -6858,6 +6858,8 @@ static void disti_net_reverse(const dist_shape *shape, disti_block *b, const flo
 static void disti_blocks_begin(const dist_shape *shape, int worker, disti_block *b, size_t n)
 {
     disti_block_layout(shape->net, disti_lane(shape->ctx, worker), b);
+    b->channel = shape->net->sdf_channel;
+    b->channels = 1;
     disti_counter_of(shape->ctx, worker)->dense += (double)dist_net_operations(shape->net, 1) * (double)n;
 }
 
@@ -6865,15 +6867,7 @@ static void disti_blocks_begin(const dist_shape *shape, int worker, disti_block 
 static void disti_block_load(const dist_shape *shape, disti_block *b, size_t n, const float *points)
 {
     b->columns = (int)n;
-    b->channel = shape->net->sdf_channel;
-    b->channels = 1;
     disti_encode(shape->net, &shape->kernels, n, points, b->point);
-}
-
-static void disti_block_begin(const dist_shape *shape, int worker, disti_block *b, size_t n, const float *points)
-{
-    disti_blocks_begin(shape, worker, b, n);
-    disti_block_load(shape, b, n, points);
 }
 
 /* Sums over no points yet. */
@@ -7264,8 +7258,6 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
     int blocks = 0, j = 0;
     disti_blocks_begin(shape, worker, &own, n);
     own.values = !gradient && !seed_fn;
-    own.channel = net->sdf_channel;
-    own.channels = 1;
     if (shape->groups) {
         size_t bytes = disti_block_layout(net, NULL, &b);
         disti_group_layout(net, disti_lane(shape->ctx, worker) + bytes, &own, &g);
@@ -7325,7 +7317,7 @@ static void disti_second_block(const dist_shape *shape, int worker, disti_block 
                                const float *directions, float *store)
 {
     const dist_net *net = shape->net;
-    disti_block_begin(shape, worker, b, n, points);
+    disti_block_load(shape, b, n, points);
     b->half = DISTI_BLOCK / 2;
     b->columns = DISTI_BLOCK; /* idle lanes repeat the last point with u = 0 and the seeds 0 */
     for (size_t c = 0; c < DISTI_BLOCK / 2; c++) {
@@ -7360,7 +7352,7 @@ static void disti_shape_second(void *user, int worker, size_t n, const float *po
     const dist_shape *shape = (const dist_shape *)user;
     const dist_net *net = shape->net;
     disti_block b;
-    disti_block_layout(net, disti_lane(shape->ctx, worker), &b);
+    disti_blocks_begin(shape, worker, &b, n);
     if (d_code) disti_fold_begin(net, &b);
     for (size_t at = 0; at < n; at += DISTI_BLOCK / 2) {
         size_t count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK / 2);
@@ -7414,11 +7406,12 @@ static void disti_wide_eval(const dist_shape *shape, int worker, size_t n, const
     float *wide[2];
     wide[0] = point + (size_t)net->point_size * stride;
     wide[1] = wide[0] + (size_t)net->max_rows * stride;
+    disti_blocks_begin(shape, worker, &b, n);
     for (size_t at = 0; at < n; at += stride) {
         size_t count = DISTI_MIN(n - at, stride), blocks = (count + DISTI_BLOCK - 1) / DISTI_BLOCK;
         for (size_t j = 0; j < blocks; j++) {
             size_t first = at + j * DISTI_BLOCK;
-            disti_block_begin(shape, worker, &b, DISTI_MIN(n - first, (size_t)DISTI_BLOCK), points + 3 * first);
+            disti_block_load(shape, &b, DISTI_MIN(n - first, (size_t)DISTI_BLOCK), points + 3 * first);
             b.columns = DISTI_BLOCK;
             disti_list_alive(shape, &b, 0);
             disti_hidden(shape, &b, 0, b.point, b.act[0]);
@@ -7579,17 +7572,17 @@ static void disti_shape_coarse(void *user, int worker, size_t n, const float *po
         disti_shape_fused(user, worker, n, points, sdf, gradient, NULL, NULL, NULL);
         return;
     }
+    disti_block b;
+    disti_blocks_begin(shape, worker, &b, n);
+    b.values = 1;
     for (size_t at = 0; at < n; at += wide) {
         size_t count = DISTI_MIN(n - at, wide), first = DISTI_MIN(count, (size_t)DISTI_BLOCK);
-        disti_counter *counter = disti_counter_of(shape->ctx, worker);
-        disti_block b;
         disti_half h;
         memset(&h, 0, sizeof h);
-        disti_block_begin(shape, worker, &b, first, points + 3 * at);
+        disti_block_load(shape, &b, first, points + 3 * at);
         if (wide > DISTI_BLOCK) /* idle lanes repeat a point here too */
             disti_encode(net, &shape->kernels, count > first ? count - first : 1,
                          points + 3 * (at + (count > first ? first : 0)), b.d_point);
-        counter->dense += (double)dist_net_operations(net, 1) * (double)(count - first);
         h.points[0] = b.point;
         h.points[1] = b.d_point;
         h.columns = (int)count;
@@ -7599,8 +7592,7 @@ static void disti_shape_coarse(void *user, int worker, size_t n, const float *po
             /* whole numbers: sums of any order are the same */
             done -= (double)((h.steps - h.alive_count) * net->layer[l].prev / DISTI_MAX(h.steps, 1)) * h.out;
         }
-        counter->done += done * (double)count;
-        b.values = 1;
+        disti_counter_of(shape->ctx, worker)->done += done * (double)count;
         b.alive_count[net->layers - 1] = last->prev + last->point;
         for (size_t from = 0, k = 0; from < count && !h.bad; from += DISTI_BLOCK, k++) {
             b.columns = (int)DISTI_MIN(count - from, (size_t)DISTI_BLOCK);
@@ -7618,11 +7610,12 @@ static void disti_shape_coarse(void *user, int worker, size_t n, const float *po
 static void disti_shape_channels(const dist_shape *shape, int worker, size_t n, const float *points, int first,
                                  int count, float *channels)
 {
+    disti_block b;
+    disti_blocks_begin(shape, worker, &b, n);
+    b.values = 1;
     for (size_t at = 0; at < n; at += DISTI_BLOCK) {
-        disti_block b;
         size_t columns = DISTI_MIN(n - at, (size_t)DISTI_BLOCK);
-        disti_block_begin(shape, worker, &b, columns, points + 3 * at);
-        b.values = 1;
+        disti_block_load(shape, &b, columns, points + 3 * at);
         const float *x = disti_net_forward(shape, &b, NULL, disti_counter_of(shape->ctx, worker));
         for (int k = 0; k < count; k++) {
             disti_net_output(shape, &b, x, first + k);
@@ -7668,11 +7661,11 @@ static void disti_shape_color_adjoint_fn(void *user, int worker, size_t n, const
     const dist_net *net = paint->net;
     size_t own = (size_t)((const dist_shape *)user)->net->code_size;
     disti_block b;
-    disti_block_layout(net, disti_lane(paint->ctx, worker), &b);
+    disti_blocks_begin(paint, worker, &b, n);
     disti_fold_begin(net, &b);
     for (size_t at = 0; at < n; at += DISTI_BLOCK) {
         size_t count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK);
-        disti_block_begin(paint, worker, &b, count, points + 3 * at);
+        disti_block_load(paint, &b, count, points + 3 * at);
         disti_color_reverse(paint, worker, &b, count, d_color + 3 * at, NULL);
         if (d_points) disti_encode_backward(paint, &b, b.pull);
         for (size_t i = 0; d_points && i < 3 * count; i++)
@@ -7763,10 +7756,11 @@ static void disti_weights_block(void *arg, int index, int worker)
             d_color[3 * c + k] = good ? d[k] : 0.0f;
         }
     }
+    disti_blocks_begin(shape, worker, &b, count);
     if (job->directions) {
         disti_second_block(shape, worker, &b, count, job->points + 3 * at, job->directions + 3 * at, store);
     } else {
-        disti_block_begin(shape, worker, &b, count, points);
+        disti_block_load(shape, &b, count, points);
         if (job->d_color) {
             disti_color_reverse(shape, worker, &b, count, d_color, store);
         } else {

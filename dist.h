@@ -9353,12 +9353,8 @@ DIST_API dist_status dist_net_set_code(dist_context *ctx, dist_net *net, int ind
     if (index < 0 || index >= net->code_count)
         return disti_fail(ctx, DIST_BAD_ARGUMENT,
                           "dist_net_set_code: index is %d, must be 0 to %d", NULL, index, net->code_count - 1);
-    for (int i = 0; i < net->code_size; i++)
-        if (!disti_finite(code[i]))
-            return disti_fail(ctx, DIST_NOT_FINITE, "dist_net_set_code: code[%d] is %d, must be finite", NULL, i,
-                              (double)code[i]);
-    memcpy(net->codes + (size_t)index * (size_t)net->code_size, code, (size_t)net->code_size * sizeof(float));
-    return DIST_OK;
+    size_t size = (size_t)net->code_size;
+    return disti_code_copy(ctx, "dist_net_set_code", 0, size, code, net->codes + (size_t)index * size);
 }
 #endif
 

@@ -6718,7 +6718,8 @@ static void disti_net_output(const dist_shape *shape, const disti_block *b, cons
 }
 
 /* delta of layer l's output (after the activation) to that of its pre-activation, in place. ReLU's mask is in it
-   already. sums, unless NULL, gets what gamma and beta receive: sum_c delta hat, sum_c delta. */
+   already. sums is NULL where no weights are asked for; LayerNorm leaves what gamma and beta receive there: sum_c delta
+   hat, sum_c delta. Rows of dead units, which were not written, become 0 where they are read. */
 static void disti_hidden_delta(const dist_shape *shape, const disti_block *b, int l, float *delta, float *sums)
 {
     const dist_net *net = shape->net;
@@ -6726,8 +6727,8 @@ static void disti_hidden_delta(const dist_shape *shape, const disti_block *b, in
     size_t width = (size_t)net->max_rows, out = (size_t)layer->out;
     const uint64_t *mask = b->mask + (size_t)(l + 1) * width;
     if (b->slope) shape->kernels.activate_back(out, (size_t)b->half, b->slope + (size_t)l * width * DISTI_BLOCK, delta);
-    if (net->activation == DIST_ACTIVATION_RELU && (net->normed || disti_use_blas(shape, l)))
-        for (size_t u = 0; u < out; u++) /* rows that are not alive were not written, but are read */
+    if (net->activation == DIST_ACTIVATION_RELU && (sums || net->normed || disti_use_blas(shape, l)))
+        for (size_t u = 0; u < out; u++)
             if (!mask[u]) memset(delta + u * DISTI_BLOCK, 0, DISTI_BLOCK * sizeof(float));
     if (!net->normed) return;
     const float *hat = b->hat + (size_t)l * width * DISTI_BLOCK;
@@ -6788,18 +6789,6 @@ static void disti_add_point_rows(const disti_linear *layer, const float *DISTI_R
         for (size_t c = 0; c < DISTI_BLOCK; c++) d_point[c] += from[c]; /* of a known length: in vectors */
 }
 
-/* Keeps layer l's delta for the weights, its dead rows as zeros. */
-static void disti_keep_delta(const dist_net *net, const disti_block *b, int l, const float *delta, float *to)
-{
-    const uint64_t *mask = b->mask + (size_t)(l + 1) * (size_t)net->max_rows;
-    int sparse = net->activation == DIST_ACTIVATION_RELU && !net->normed;
-    for (size_t u = 0; u < (size_t)net->layer[l].out; u++) {
-        float *row = to + disti_unit(net, l, u) * DISTI_BLOCK;
-        if (sparse && !mask[u]) memset(row, 0, DISTI_BLOCK * sizeof(float));
-        else memcpy(row, delta + u * DISTI_BLOCK, DISTI_BLOCK * sizeof(float));
-    }
-}
-
 /* delta of the last layer's input: sum over the channels of W_k^T seed_k, masked. */
 static void disti_output_backward(const dist_shape *shape, const disti_block *b, const float *seed, float *delta)
 {
@@ -6846,7 +6835,9 @@ static void disti_net_reverse(const dist_shape *shape, disti_block *b, const flo
         layer = &net->layer[l];
         disti_hidden_delta(shape, b, l, delta,
                            store ? store + disti_store_offset(net, l, DISTI_STORE_NORM) : NULL);
-        if (store) disti_keep_delta(net, b, l, delta, store + disti_store_offset(net, l, DISTI_STORE_DELTA));
+        float *kept = store ? store + disti_store_offset(net, l, DISTI_STORE_DELTA) : NULL;
+        for (size_t u = 0; kept && u < (size_t)layer->out; u++)
+            memcpy(kept + disti_unit(net, l, u) * DISTI_BLOCK, delta + u * DISTI_BLOCK, DISTI_BLOCK * sizeof(float));
         float *d_x = disti_delta_room(net, b, l - 1, &fold);
         disti_linear_backward(shape, b, l, delta, d_x);
         disti_add_point_rows(layer, d_x, b->d_point);

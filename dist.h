@@ -6442,10 +6442,11 @@ static void disti_encode(const dist_net *net, const disti_kernels *kernels, size
 
 /* backward  d_p = d_raw + sum_k b 2^k (cos(b 2^k p) d_sin_k - sin(b 2^k p) d_cos_k)
    The tangents' rows sin' = b 2^k cos u, cos' = -b 2^k sin u have the same adjoint in terms of themselves. */
-static void disti_encode_backward(const dist_shape *shape, const disti_block *b, float *d_points)
+static void disti_encode_backward(const dist_shape *shape, const disti_block *b)
 {
     const dist_net *net = shape->net;
     const float *rows = b->point, *d_rows = b->d_point;
+    float *d_points = b->pull;
     size_t half = (size_t)b->half;
     if (net->raw && net->levels == 0) {
         shape->kernels.points(d_rows, d_points);
@@ -6816,9 +6817,9 @@ static float *disti_delta_room(const dist_net *net, const disti_block *b, int l,
     return b->fold_delta + (size_t)--*fold * (size_t)net->max_rows * DISTI_BLOCK;
 }
 
-/* Reverse pass of one block from the seeds (channels, B) at the last layer's pre-activation: leaves the encoded
-   point's gradient in b->d_point and the deltas of the layers that see the code in b->fold_delta; store, unless NULL,
-   gets all deltas. */
+/* Reverse pass of one block from the seeds (channels, B) at the last layer's pre-activation: leaves the points'
+   gradient in b->pull and the deltas of the layers that see the code in b->fold_delta; store, unless NULL, gets all
+   deltas. */
 static void disti_net_reverse(const dist_shape *shape, disti_block *b, const float *seed, float *store)
 {
     const dist_net *net = shape->net;
@@ -6843,6 +6844,7 @@ static void disti_net_reverse(const dist_shape *shape, disti_block *b, const flo
         disti_add_point_rows(layer, d_x, b->d_point);
         delta = d_x;
     }
+    disti_encode_backward(shape, b);
 }
 
 /* Makes the worker's memory ready for blocks of n points in all. */
@@ -7283,7 +7285,6 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
         if (sdf) memcpy(sdf + at, block->value, count * sizeof(float));
         if (own.values) continue;
         disti_net_reverse(shape, block, block->value_slope, NULL);
-        disti_encode_backward(shape, block, own.pull);
         if (gradient) memcpy(gradient + 3 * at, own.pull, 3 * count * sizeof(float));
         if (!seed_fn) continue;
         seed_fn(seed_user, at, count, block->value, own.pull, own.seed);
@@ -7333,7 +7334,6 @@ static void disti_second_block(const dist_shape *shape, int worker, disti_block 
         b->seed[DISTI_BLOCK / 2 + c] = b->value_slope[c];
     }
     disti_net_reverse(shape, b, b->seed, store);
-    disti_encode_backward(shape, b, b->pull);
 }
 
 /* dist_field.second_fn of a net. */
@@ -7658,7 +7658,6 @@ static void disti_shape_color_adjoint_fn(void *user, int worker, size_t n, const
         size_t count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK);
         disti_block_load(paint, &b, count, points + 3 * at);
         disti_color_reverse(paint, worker, &b, count, d_color + 3 * at, NULL);
-        if (d_points) disti_encode_backward(paint, &b, b.pull);
         for (size_t i = 0; d_points && i < 3 * count; i++)
             if (disti_finite(b.pull[i])) d_points[3 * at + i] += b.pull[i];
         if (!d_code && !d_color_code) continue;
@@ -7769,7 +7768,6 @@ static void disti_weights_block(void *arg, int index, int worker)
             }
             disti_net_reverse(shape, &b, seed, store);
         }
-        disti_encode_backward(shape, &b, b.pull);
     }
     size_t columns = job->directions ? (size_t)DISTI_BLOCK : count, channels = job->d_color ? 3 : 1;
     disti_weights_drop(shape, columns, channels, store);

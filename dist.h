@@ -6272,7 +6272,7 @@ static dist_status disti_archive_write(dist_context *ctx, const char *function, 
 }
 
 enum { DISTI_MAX_LAYERS = 32, DISTI_MAX_WIDTH = 8192, DISTI_MAX_LEVELS = 16, DISTI_MAX_CHANNELS = 16 };
-enum { DISTI_OUTPUT_NONE, DISTI_OUTPUT_TANH, DISTI_OUTPUT_SIGMOID, DISTI_OUTPUT_TANH_TWICE };
+enum { DISTI_OUTPUT_TANH, DISTI_OUTPUT_NONE, DISTI_OUTPUT_SIGMOID, DISTI_OUTPUT_TANH_TWICE };
 enum { DISTI_ORDER_SIN_COS, DISTI_ORDER_COS_ALL, DISTI_ORDER_SIN_ALL };
 
 /* One linear layer. Its rows, as the kernels see them, are the previous layer's units (`prev`), then, in layer 0 and in
@@ -8352,8 +8352,7 @@ static dist_net *disti_net_new(dist_context *ctx)
 
 /* From the in and out of every layer, the sizes of input and code and the skips: what each column is, where each tensor
    stands in params and panels, and the memory for both. */
-static dist_status disti_net_arrange(dist_context *ctx, dist_net *net, const char *function, const int *skip,
-                                     float skip_scale)
+static dist_status disti_net_arrange(dist_context *ctx, dist_net *net, const int *skip, float skip_scale)
 {
     int input = net->point_size + net->code_size;
     for (int l = 0; l < net->layers; l++) {
@@ -8364,8 +8363,9 @@ static dist_status disti_net_arrange(dist_context *ctx, dist_net *net, const cha
         layer->code = sees_input ? net->code_size : 0;
         layer->scale = l > 0 && skip[l] ? skip_scale : 1.0f;
         if (layer->in != layer->prev + (sees_input ? input : 0))
-            return disti_fail(ctx, DIST_BAD_FILE, "%s: a layer is %d wide at its input, but what feeds it has %d",
-                              function, layer->in, layer->prev + (sees_input ? input : 0));
+            return disti_fail(ctx, DIST_BAD_FILE,
+                              "dist_net_load: a layer is %d wide at its input, but what feeds it has %d", NULL,
+                              layer->in, layer->prev + (sees_input ? input : 0));
         int at = layer->prev > 0 && !net->skip_input_first ? layer->prev : 0;
         layer->x_column = at > 0 || !sees_input ? 0 : input;
         layer->point_column = at + (net->point_first ? 0 : net->code_size);
@@ -8394,12 +8394,6 @@ static size_t disti_half_steps(const disti_linear *layer, int kind)
     return (size_t)(kind == DIST_HALF_BF16 ? (layer->prev + 1) / 2 : layer->prev);
 }
 
-/* Numbers of 32 bits in half_panels. */
-static size_t disti_half_size(const disti_linear *layer, int kind)
-{
-    return disti_half_steps(layer, kind) * disti_round_up((size_t)layer->out, 8);
-}
-
 /* The largest weight that is packed. */
 static float disti_half_largest(const dist_net *net)
 {
@@ -8423,7 +8417,7 @@ static void disti_half_pack(dist_net *net)
         disti_linear *layer = &net->layer[l];
         size_t rows = (size_t)(layer->prev + layer->point), steps = disti_half_steps(layer, net->half);
         layer->half_panel = offset;
-        offset += disti_half_size(layer, net->half);
+        offset += steps * disti_round_up((size_t)layer->out, 8);
         for (size_t o = 0; o < (size_t)layer->out; o += 8) {
             for (size_t at = 0; at < steps * 8; at++) {
                 const float *w = net->panels + layer->panel + o * rows;
@@ -8553,7 +8547,7 @@ DIST_API dist_status dist_net_set_half(dist_context *ctx, dist_net *net, int kin
     float *panels = NULL;
     size_t count = 0;
     for (int l = 0; l + 1 < net->layers && kind != DIST_HALF_OFF; l++) /* at most panel_count in all: that exists */
-        count += disti_half_size(&net->layer[l], kind);
+        count += disti_half_steps(&net->layer[l], kind) * disti_round_up((size_t)net->layer[l].out, 8);
     if (count > 0) {
         panels = (float *)net->allocator.alloc_fn(net->allocator.user, count * sizeof(float), DISTI_ALIGNMENT);
         if (!panels)
@@ -8576,7 +8570,6 @@ DIST_API int dist_net_half(const dist_net *net) { return net ? net->half : DIST_
 typedef struct disti_loader {
     dist_context *ctx;
     disti_archive archive;
-    const char *function;
     const char *prefix;
     dist_net *net;
     dist_status status; /* of the first failure: after it nothing more is read */
@@ -8734,12 +8727,11 @@ static dist_status disti_loader_meta(disti_loader *loader)
 {
     dist_net *net = loader->net;
     if (disti_loader_keys(loader) != DIST_OK) return loader->status;
-    static const int outputs[4] = {DISTI_OUTPUT_TANH, DISTI_OUTPUT_NONE, DISTI_OUTPUT_SIGMOID, DISTI_OUTPUT_TANH_TWICE};
     if (disti_loader_activation(loader) != DIST_OK || disti_loader_channels(loader) != DIST_OK) return loader->status;
     int encoding = disti_loader_choice(loader, "dist.encoding", "none|fourier");
     int levels = disti_loader_whole(loader, "dist.encoding.levels", 0, DISTI_MAX_LEVELS, 0);
     int raw = disti_loader_whole(loader, "dist.encoding.raw", 0, 1, 1);
-    net->output = outputs[disti_loader_choice(loader, "dist.output", "tanh|none|sigmoid|tanh:2")];
+    net->output = disti_loader_choice(loader, "dist.output", "tanh|none|sigmoid|tanh:2");
     net->point_first = disti_loader_choice(loader, "dist.input", "code,xyz|xyz,code");
     net->skip_input_first = disti_loader_choice(loader, "dist.skip_order", "x,input|input,x");
     net->levels = encoding ? levels : 0;
@@ -8923,9 +8915,8 @@ static dist_status disti_loader_open(disti_loader *loader, dist_context *ctx, co
 {
     memset(loader, 0, sizeof *loader);
     loader->ctx = ctx;
-    loader->function = "dist_net_load";
     if (!bytes) return disti_refuse(ctx, "dist_net_load: bytes is NULL", NULL);
-    return disti_archive_open(ctx, loader->function, bytes, size, &loader->archive);
+    return disti_archive_open(ctx, "dist_net_load", bytes, size, &loader->archive);
 }
 
 /* From metadata and shapes all of loader->net (zeroed but for disti_net_begin) but its numbers, and their memory. */
@@ -8935,7 +8926,7 @@ static dist_status disti_loader_arrange(disti_loader *loader)
         disti_loader_codes(loader) != DIST_OK)
         return loader->status;
     dist_net *net = loader->net;
-    dist_status status = disti_net_arrange(loader->ctx, net, loader->function, loader->skip, loader->skip_scale);
+    dist_status status = disti_net_arrange(loader->ctx, net, loader->skip, loader->skip_scale);
     /* of smaller ones so little comes from beyond the second cache that their order hardly matters */
     int order = disti_net_sparse(net) && net->max_rows >= 384 && !loader->ctx->blas.sgemm_fn;
     if (status != DIST_OK || !order) return status;
@@ -9011,7 +9002,7 @@ static void disti_saver_exactly(disti_saver *s, const char *key, double x)
 static void disti_saver_meta(disti_saver *s, const dist_net *net)
 {
     static const char activations[6][12] = {"relu", "elu", "softplus:", "sine:", "tanh", "none"};
-    static const char outputs[4][8] = {"none", "tanh", "sigmoid", "tanh:2"};
+    static const char outputs[4][8] = {"tanh", "none", "sigmoid", "tanh:2"};
     static const char orders[3][16] = {"sin,cos", "cos_all,sin_all", "sin_all,cos_all"};
     float skip_scale = 1.0f;
     memset(s, 0, sizeof *s);
@@ -9308,8 +9299,7 @@ DIST_API dist_net *dist_net_create(dist_context *ctx, const dist_net_desc *desc)
         net->layer[l].out = l + 1 == net->layers ? net->channels : d.width;
         net->layer[l].in = (l > 0 ? d.width : 0) + (l == 0 || skip[l] ? net->point_size + d.code_size : 0);
     }
-    if (disti_net_arrange(ctx, net, "dist_net_create", skip, 1.0f) != DIST_OK ||
-        disti_net_randomize(ctx, net, &d) != DIST_OK) {
+    if (disti_net_arrange(ctx, net, skip, 1.0f) != DIST_OK || disti_net_randomize(ctx, net, &d) != DIST_OK) {
         dist_net_destroy(net);
         return NULL;
     }

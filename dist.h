@@ -6602,18 +6602,11 @@ static void disti_hidden(const dist_shape *shape, disti_block *b, int l, const f
         disti_linear_blas(shape, l, bias, DISTI_BLOCK, DISTI_BLOCK, x, x + (size_t)layer->prev * DISTI_BLOCK, y);
         if (plain) shape->kernels.relu(out, y, mask);
     } else {
-        disti_gemm g;
-        g.weights = net->panels + layer->panel;
-        g.bias = bias;
-        g.x = x;
-        g.y = y;
-        g.rows = layer->prev + layer->point;
-        g.alive = b->alive_count[l] < g.rows ? b->alive + (size_t)l * width : NULL;
-        g.alive_count = b->alive_count[l];
-        g.mask = plain && !disti_all_alive(shape, b, l + 1) ? mask : NULL;
-        g.relu = plain;
-        g.out = layer->out;
-        g.columns = b->columns;
+        int rows = layer->prev + layer->point, alive_count = b->alive_count[l];
+        const int *alive = alive_count < rows ? b->alive + (size_t)l * width : NULL;
+        uint64_t *asked = plain && !disti_all_alive(shape, b, l + 1) ? mask : NULL;
+        disti_gemm g = {net->panels + layer->panel, bias, x, y, alive, asked, rows, alive_count, layer->out,
+                        b->columns, plain};
         shape->kernels.gemm(&g);
     }
     if (net->normed && !b->half)
@@ -6752,10 +6745,7 @@ static void disti_linear_backward(const dist_shape *shape, const disti_block *b,
     size_t width = (size_t)net->max_rows;
     int relu = net->activation == DIST_ACTIVATION_RELU;
     const uint64_t *mask = relu ? b->mask + (size_t)l * width : NULL;
-    disti_gemm_back g;
-    g.rows = layer->prev + layer->point;
-    g.out = layer->out;
-    g.columns = b->columns;
+    int rows = layer->prev + layer->point;
     if (disti_use_blas(shape, l)) {
         const dist_blas *blas = &shape->ctx->blas;
         const float *w = net->params + layer->weight;
@@ -6765,20 +6755,16 @@ static void disti_linear_backward(const dist_shape *shape, const disti_block *b,
             blas->sgemm_fn(blas->user, 1, 0, layer->point, DISTI_BLOCK, layer->out, layer->scale,
                            w + layer->point_column, layer->in, delta, DISTI_BLOCK, 0.0f,
                            d_x + (size_t)layer->prev * DISTI_BLOCK, DISTI_BLOCK);
-        for (size_t u = 0; mask && u < (size_t)g.rows; u++)
+        for (size_t u = 0; mask && u < (size_t)rows; u++)
             for (size_t c = 0; c < DISTI_BLOCK; c++)
                 if (!(mask[u] >> c & 1u)) d_x[u * DISTI_BLOCK + c] = 0.0f;
         return;
     }
-    g.weights = net->panels + layer->panel;
-    g.d_y = delta;
-    g.d_x = d_x;
-    g.mask = mask;
-    g.alive_rows = b->alive_count[l] < g.rows ? b->alive + (size_t)l * width : NULL;
-    g.alive_rows_count = b->alive_count[l];
     int sparse = relu && !net->normed && b->alive_units[l + 1] < layer->out;
-    g.alive_out = sparse ? b->alive + (size_t)(l + 1) * width : NULL;
-    g.alive_out_count = b->alive_units[l + 1];
+    const int *alive_out = sparse ? b->alive + (size_t)(l + 1) * width : NULL;
+    const int *alive_rows = b->alive_count[l] < rows ? b->alive + (size_t)l * width : NULL;
+    disti_gemm_back g = {net->panels + layer->panel, delta, d_x, alive_out, alive_rows, mask, rows, layer->out,
+                         b->alive_units[l + 1], b->alive_count[l], b->columns};
     shape->kernels.gemm_back(&g);
 }
 
@@ -6993,18 +6979,8 @@ static const float *disti_few_forward(const dist_shape *shape, disti_block *b, d
         b->alive_count[l] = count;
         done += (double)count * layer->out;
         if (l == last) break;
-        disti_few few;
-        few.weights = net->panels + layer->panel;
-        few.bias = shape->bias + (size_t)l * width;
-        few.x = x;
-        few.list = list;
-        few.y = b->act[(l + 1) & 1];
-        few.sum = sum;
-        few.stride = width;
-        few.rows = layer->prev + layer->point;
-        few.count = count;
-        few.out = layer->out;
-        few.points = b->columns;
+        disti_few few = {net->panels + layer->panel, shape->bias + (size_t)l * width, x, list, b->act[(l + 1) & 1],
+                         sum, width, layer->prev + layer->point, count, layer->out, b->columns};
         shape->kernels.few(&few);
     }
     counter->done += done * b->columns;
@@ -7140,18 +7116,9 @@ static void disti_group_input(const dist_shape *shape, disti_group *g, int l, in
         alive[count] = unit[i];
         count += mask[unit[i]] != 0;
     }
-    disti_fit fit;
-    fit.list = alive;
-    fit.x = x;
-    fit.d = g->away + j * 3 * DISTI_BLOCK;
-    fit.sum = g->sum + (size_t)j * 5 * width;
-    fit.mask = mask;
-    fit.model = model;
-    fit.stride = width;
-    memcpy(fit.half, g->half[j], sizeof fit.half);
-    fit.slack = slack;
-    fit.count = count;
-    fit.columns = (g->count[j] + 15) / 16 * 16;
+    const float *half = g->half[j];
+    disti_fit fit = {alive, x, g->away + j * 3 * DISTI_BLOCK, g->sum + (size_t)j * 5 * width, mask, model, width,
+                     {half[0], half[1], half[2]}, slack, count, (g->count[j] + 15) / 16 * 16};
     if (l + 1 < net->layers) shape->kernels.fit(&fit);
     g->alive_units[j][l] = count;
     for (int i = 0; i < layer->point; i++, count++) {
@@ -7161,7 +7128,7 @@ static void disti_group_input(const dist_shape *shape, disti_group *g, int l, in
         memcpy(x + (size_t)(layer->prev + i) * DISTI_BLOCK, point + i * DISTI_BLOCK, DISTI_BLOCK * sizeof(float));
         m[0] = c;
         for (int k = 0; k < 3; k++) m[1 + k] = i == k ? 1.0f : 0.0f;
-        m[4] = slack * (g->half[j][i] + fabsf(c));
+        m[4] = slack * (half[i] + fabsf(c));
     }
     g->alive_count[j][l] = count;
 }
@@ -7178,41 +7145,23 @@ static double disti_group_forward(const dist_shape *shape, disti_group *g, int n
     for (int j = 0; j < g->blocks; j++) disti_group_input(shape, g, 0, j, 0, slack);
     for (int l = 0; l < last; l++) {
         const disti_linear *layer = &net->layer[l];
-        const float *bias = shape->bias + (size_t)l * width;
-        disti_bound bound;
+        const float *weights = net->panels + layer->panel, *bias = shape->bias + (size_t)l * width;
+        int rows = layer->prev + layer->point, out = layer->out;
         for (int j = 0; j < g->blocks; j++) count[j] = g->alive_count[j][l];
-        bound.weights = net->panels + layer->panel;
-        bound.list = g->alive + (size_t)l * width;
-        bound.count = count;
-        bound.model = g->model;
-        bound.sum = g->sum;
-        bound.stride = width;
-        bound.list_stride = all;
-        bound.rows = layer->prev + layer->point;
-        bound.out = layer->out;
-        bound.blocks = g->blocks;
+        disti_bound bound = {weights, g->alive + (size_t)l * width, count, g->model, g->sum, width, all, rows, out,
+                             g->blocks};
         shape->kernels.bound(&bound);
         for (int j = 0; j < g->blocks; j++) {
             size_t block = (size_t)j * width, at = (size_t)j * all + (size_t)l * width;
             const int *live = g->live;
-            int units = 0, out = layer->out, *unit = g->unit;
-            disti_gemm m;
+            int units = 0, columns = (g->count[j] + 15) / 16 * 16, *unit = g->unit;
+            disti_gemm m = {weights, bias, g->x[l & 1][j], g->x[(l + 1) & 1][j], g->alive + at, g->mask + at + width,
+                            rows, count[j], out, columns, 1};
             shape->kernels.live((size_t)out, g->sum + 5 * block, width, bias, slack, g->cell[j], g->live);
             for (int o = 0; o < out; o++) {
                 unit[units] = o;
                 units += live[o];
             }
-            m.weights = bound.weights;
-            m.bias = bias;
-            m.x = g->x[l & 1][j];
-            m.y = g->x[(l + 1) & 1][j];
-            m.alive = g->alive + at;
-            m.alive_count = count[j];
-            m.mask = g->mask + at + width;
-            m.rows = bound.rows;
-            m.out = out;
-            m.columns = (g->count[j] + 15) / 16 * 16;
-            m.relu = 1;
             shape->kernels.gemm_some(&m, unit, units);
             done += (double)count[j] * (5.0 * (double)layer->out + (double)units * (double)g->count[j]);
             disti_group_input(shape, g, l + 1, j, units, slack);
@@ -7793,15 +7742,9 @@ static void disti_weights_rows(const disti_weights_job *job, int l, size_t o, si
     const float *xt = store + disti_store_offset(net, l, DISTI_STORE_INPUT);
     size_t values = DISTI_MIN(job->n - job->first - (size_t)index * job->block, job->block);
     float *w = job->d_weights + layer->weight + row * (size_t)layer->in, ones[16], sum[DISTI_WEIGHT_ROWS];
-    disti_gemm_weights g;
-    g.d_y = store + disti_store_offset(net, l, DISTI_STORE_DELTA) + o * DISTI_BLOCK;
-    g.xt = xt;
-    g.d_weights = w + layer->x_column;
-    g.stride = (size_t)layer->in;
-    g.xt_stride = disti_store_stride(layer);
-    g.out = (int)count;
-    g.rows = layer->prev;
-    g.columns = job->directions ? DISTI_BLOCK : (int)values;
+    const float *delta = store + disti_store_offset(net, l, DISTI_STORE_DELTA) + o * DISTI_BLOCK;
+    disti_gemm_weights g = {delta, xt, w + layer->x_column, (size_t)layer->in, disti_store_stride(layer), (int)count,
+                            layer->prev, job->directions ? DISTI_BLOCK : (int)values};
     shape->kernels.gemm_weights(&g);
     g.xt = xt + layer->prev;
     g.d_weights = w + layer->point_column;
@@ -8495,20 +8438,10 @@ static void disti_net_sort(const dist_context *ctx, dist_net *net)
         kernels.rows(points, point);
         for (int l = 0; l + 1 < net->layers; l++) {
             const disti_linear *layer = &net->layer[l];
-            disti_gemm g;
+            disti_gemm g = {net->panels + layer->panel, bias + (size_t)l * width, x[l & 1], x[(l + 1) & 1], NULL, mask,
+                            layer->prev + layer->point, 0, layer->out, DISTI_BLOCK, 1};
             memcpy(x[l & 1] + (size_t)layer->prev * DISTI_BLOCK, point,
                    (size_t)layer->point * DISTI_BLOCK * sizeof(float));
-            g.weights = net->panels + layer->panel;
-            g.bias = bias + (size_t)l * width;
-            g.x = x[l & 1];
-            g.y = x[(l + 1) & 1];
-            g.alive = NULL;
-            g.alive_count = 0;
-            g.mask = mask;
-            g.rows = layer->prev + layer->point;
-            g.out = layer->out;
-            g.columns = DISTI_BLOCK;
-            g.relu = 1;
             kernels.gemm(&g);
             for (size_t o = 0; o < (size_t)layer->out; o++)
                 for (uint64_t m = mask[o]; m; m &= m - 1) count[(size_t)l * width + o]++;

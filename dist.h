@@ -7068,34 +7068,33 @@ static int disti_net_groups(const dist_context *ctx, const dist_net *net)
     return disti_net_sparse(net) && !blas;
 }
 
+/* The middle of n numbers and half their range, a little more than rounding takes away. */
+static void disti_middle(int n, const float *x, float *middle, float *half)
+{
+    float low = 3e38f, high = -3e38f;
+    for (int i = 0; i < n; i++) {
+        low = DISTI_MIN(low, x[i]);
+        high = DISTI_MAX(high, x[i]);
+    }
+    *middle = 0.5f * (low + high);
+    *half = 0.50001f * (high - low);
+}
+
 /* Makes the group of n points (n, 3) ready: their rows, idle lanes repeating the last point, and their boxes. */
-static void disti_group_begin(disti_group *g, int n, const float *points)
+static void disti_group_begin(const dist_shape *shape, disti_group *g, int n, const float *points)
 {
     g->blocks = (n + DISTI_BLOCK - 1) / DISTI_BLOCK;
     for (int j = 0; j < g->blocks; j++, points += 3 * DISTI_BLOCK) {
         int count = DISTI_MIN(n - j * DISTI_BLOCK, (int)DISTI_BLOCK);
         float *point = g->point + j * 3 * DISTI_BLOCK, *away = g->away + j * 3 * DISTI_BLOCK;
         g->count[j] = count;
-        for (int k = 0; k < 3; k++) {
-            float low = 3e38f, high = -3e38f, *to = point + k * DISTI_BLOCK;
-            for (int i = 0; i < count; i++) {
-                to[i] = points[3 * i + k];
-                low = DISTI_MIN(low, to[i]);
-                high = DISTI_MAX(high, to[i]);
-            }
-            for (int i = count; i < DISTI_BLOCK; i++) to[i] = to[count - 1];
-            g->center[j][k] = 0.5f * (low + high);
-            g->half[j][k] = 0.50001f * (high - low);
-            for (int i = 0; i < DISTI_BLOCK; i++) away[k * DISTI_BLOCK + i] = to[i] - g->center[j][k];
-            for (int i = 0; i < DISTI_CELLS; i++) {
-                float least = 3e38f, most = -3e38f;
-                for (int c = i * DISTI_CELL_POINTS; c < (i + 1) * DISTI_CELL_POINTS; c++) {
-                    least = DISTI_MIN(least, away[k * DISTI_BLOCK + c]);
-                    most = DISTI_MAX(most, away[k * DISTI_BLOCK + c]);
-                }
-                g->cell[j][6 * i + k] = 0.5f * (least + most);
-                g->cell[j][6 * i + 3 + k] = 0.50001f * (most - least);
-            }
+        disti_encode(shape->net, &shape->kernels, (size_t)count, points, point);
+        for (int k = 0; k < 3; k++, point += DISTI_BLOCK, away += DISTI_BLOCK) {
+            disti_middle(DISTI_BLOCK, point, &g->center[j][k], &g->half[j][k]);
+            for (int i = 0; i < DISTI_BLOCK; i++) away[i] = point[i] - g->center[j][k];
+            for (int i = 0; i < DISTI_CELLS; i++)
+                disti_middle(DISTI_CELL_POINTS, away + i * DISTI_CELL_POINTS, &g->cell[j][6 * i + k],
+                             &g->cell[j][6 * i + 3 + k]);
         }
     }
 }
@@ -7141,7 +7140,7 @@ static double disti_group_forward(const dist_shape *shape, disti_group *g, int n
     float slack = 5e-7f * (float)(net->max_rows + 16); /* twice 4 (K + 4) 2^-24 */
     double done = 0.0;
     size_t width = (size_t)net->max_rows, all = (size_t)net->layers * width;
-    disti_group_begin(g, n, points);
+    disti_group_begin(shape, g, n, points);
     for (int j = 0; j < g->blocks; j++) disti_group_input(shape, g, 0, j, 0, slack);
     for (int l = 0; l < last; l++) {
         const disti_linear *layer = &net->layer[l];

@@ -5557,7 +5557,7 @@ typedef struct disti_reader {
     const unsigned char *bytes, *header, *cursor, *end;
     size_t data_size;
     disti_archive *archive; /* its block is NULL while counting */
-    size_t tensor_count, meta_count, text_size;
+    size_t text_size;
     char *text;             /* the strings, each with its NUL; NULL while counting */
     size_t text_bytes;
 } disti_reader;
@@ -5835,13 +5835,12 @@ static int disti_archive_metadata(disti_reader *r)
     for (; more == 1; more = disti_json_next(r, '}')) {
         const char *key, *value;
         if (!disti_archive_name(r, "metadata key", &key) || !disti_json_keep(r, &value)) return 0;
-        if (r->meta_count == DISTI_META_MAX)
+        size_t index = r->archive->meta_count++;
+        if (index == DISTI_META_MAX)
             return disti_bad(r, "is one too many, there must be at most %d", NULL, DISTI_META_MAX, 0);
-        if (r->text) {
-            r->archive->keys[r->meta_count] = key;
-            r->archive->values[r->meta_count] = value;
-        }
-        r->meta_count++;
+        if (!r->text) continue;
+        r->archive->keys[index] = key;
+        r->archive->values[index] = value;
     }
     return more == 0;
 }
@@ -5851,7 +5850,7 @@ static int disti_archive_pass(disti_reader *r)
 {
     int metadata = 0;
     r->cursor = r->header;
-    r->tensor_count = r->meta_count = r->text_size = 0;
+    r->archive->tensor_count = r->archive->meta_count = r->text_size = 0;
     disti_archive_about(r, "the header", NULL, 0);
     int more = disti_json_open(r, '{', '}');
     for (; more == 1; more = disti_json_next(r, '}')) {
@@ -5866,10 +5865,10 @@ static int disti_archive_pass(disti_reader *r)
             continue;
         }
         disti_tensor counted;
-        disti_tensor *tensor = r->text ? &r->archive->tensors[r->tensor_count] : &counted;
+        disti_tensor *tensor = r->text ? &r->archive->tensors[r->archive->tensor_count] : &counted;
         r->cursor = first;
         if (!disti_archive_name(r, "tensor", &tensor->name) || !disti_archive_tensor(r, tensor)) return 0;
-        r->tensor_count++;
+        r->archive->tensor_count++;
     }
     if (more < 0) return 0;
     disti_archive_about(r, "the header", NULL, 0);
@@ -6016,9 +6015,9 @@ static dist_status disti_archive_open(dist_context *ctx, const char *function, c
     r.archive = archive;
     if (!disti_archive_header(&r, size) || !disti_archive_pass(&r)) return DIST_BAD_FILE;
     size_t tensors, pairs, order, total;
-    disti_size_mul(r.tensor_count, sizeof(disti_tensor), &tensors);
-    disti_size_mul(r.meta_count, 2 * sizeof(char *), &pairs);
-    disti_size_mul(DISTI_MAX(r.tensor_count, r.meta_count), sizeof(void *), &order);
+    disti_size_mul(archive->tensor_count, sizeof(disti_tensor), &tensors);
+    disti_size_mul(archive->meta_count, 2 * sizeof(char *), &pairs);
+    disti_size_mul(DISTI_MAX(archive->tensor_count, archive->meta_count), sizeof(void *), &order);
     disti_size_add(tensors, pairs, &total);
     disti_size_add(total, order, &total);
     disti_size_add(total, r.text_size, &total);
@@ -6028,10 +6027,8 @@ static dist_status disti_archive_open(dist_context *ctx, const char *function, c
     archive->block_bytes = total;
     archive->tensors = (disti_tensor *)(void *)block;
     archive->keys = (const char **)(void *)(block + tensors);
-    archive->values = archive->keys + r.meta_count;
+    archive->values = archive->keys + archive->meta_count;
     archive->order = (const void **)(void *)(block + tensors + pairs);
-    archive->tensor_count = r.tensor_count;
-    archive->meta_count = r.meta_count;
     r.text = (char *)block + tensors + pairs + order;
     r.text_bytes = r.text_size;
     if (disti_archive_pass(&r) && disti_archive_check(&r)) return DIST_OK;
@@ -6539,7 +6536,7 @@ static int disti_net_sparse(const dist_net *net)
            net->max_rows <= 1100 && disti_net_narrowest(net) >= 96;
 }
 
-/* The file's number of unit u of layer l. */
+/* The file's number of unit u of layer l; the last layer's stand as in the file. */
 static size_t disti_unit(const dist_net *net, int l, size_t u)
 {
     return net->unit_order ? (size_t)net->unit_order[(size_t)l * (size_t)net->max_rows + u] : u;
@@ -6885,10 +6882,9 @@ static void disti_fold_backward(const dist_shape *shape, disti_block *b, size_t 
         size_t out = (size_t)(l + 1 == net->layers ? b->channels : layer->out);
         size_t row = l + 1 == net->layers ? (size_t)b->channel : 0;
         for (size_t o = 0; o < out; o++) {
-            size_t unit = l + 1 == net->layers ? o + row : disti_unit(net, l, o);
-            const float *w = net->params + layer->weight + unit * (size_t)layer->in + layer->code_column;
+            const float *w = net->params + layer->weight + disti_unit(net, l, row + o) * (size_t)layer->in;
             double s = sum[o] * (double)layer->scale;
-            if (s != 0.0) shape->kernels.axpy(count, s, w + first, d_code);
+            if (s != 0.0) shape->kernels.axpy(count, s, w + layer->code_column + first, d_code);
         }
     }
 }
@@ -8045,7 +8041,7 @@ static void disti_net_fold(const dist_net *net, const float *code, float *bias)
     for (int l = 0; l < net->layers; l++, bias += net->max_rows) {
         const disti_linear *layer = &net->layer[l];
         for (size_t o = 0; o < (size_t)layer->out; o++) {
-            size_t unit = l + 1 < net->layers ? disti_unit(net, l, o) : o;
+            size_t unit = disti_unit(net, l, o);
             const float *w = net->params + layer->weight + unit * (size_t)layer->in + layer->code_column;
             double sum = 0.0;
             for (size_t j = 0; code && j < (size_t)layer->code; j++) sum += (double)w[j] * (double)code[j];
@@ -8388,7 +8384,7 @@ static void disti_net_pack(dist_net *net)
         size_t rows = (size_t)(layer->prev + layer->point);
         int last = l + 1 == net->layers;
         for (size_t o = 0; o < (size_t)layer->out; o++) {
-            const float *w = net->params + layer->weight + (last ? o : disti_unit(net, l, o)) * (size_t)layer->in;
+            const float *w = net->params + layer->weight + disti_unit(net, l, o) * (size_t)layer->in;
             for (size_t k = 0; k < rows; k++) {
                 size_t column = k < (size_t)layer->prev ? (size_t)layer->x_column + disti_unit(net, l - 1, k)
                                                         : (size_t)layer->point_column + k - (size_t)layer->prev;

@@ -5508,10 +5508,7 @@ static void disti_put_text(disti_writer *w, const char *text)
 static void disti_put_size(disti_writer *w, size_t value)
 {
     char digits[24];
-    size_t n = sizeof digits;
-    do digits[--n] = (char)('0' + value % 10);
-    while (value /= 10);
-    disti_put(w, digits + n, sizeof digits - n);
+    disti_put(w, digits, disti_format_whole(digits, value));
 }
 
 static void disti_put_number(disti_writer *w, double x, int digits)

@@ -6650,24 +6650,20 @@ static const float *disti_net_forward(const dist_shape *shape, disti_block *b, f
     return x;
 }
 
-/* v less the level to value, but where value, the layer's sum, is not finite: that is what the ray is told. */
-DISTI_LOOPS static void disti_output_values(size_t count, float level, const float *DISTI_RESTRICT v,
-                                            float *DISTI_RESTRICT value)
+/* v less the level to value, but where value, the layer's sum, is not finite: that is what the ray is told. There the
+   slope d, unless NULL, and the curvature are 0. */
+DISTI_LOOPS static void disti_output_end(size_t count, float level, const float *DISTI_RESTRICT v,
+                                         float *DISTI_RESTRICT value, float *DISTI_RESTRICT d,
+                                         float *DISTI_RESTRICT bend)
 {
+    for (size_t c = 0; d && c < count; c++) {
+        const float slope = d[c], curvature = bend[c];
+        d[c] = disti_finite(value[c]) ? slope : 0.0f;
+        bend[c] = disti_finite(value[c]) ? curvature : 0.0f;
+    }
     for (size_t c = 0; c < count; c++) {
         const float moved = v[c] - level;
         value[c] = disti_finite(value[c]) ? moved : value[c];
-    }
-}
-
-/* There the slope and the curvature are 0. */
-DISTI_LOOPS static void disti_output_slopes(size_t count, const float *DISTI_RESTRICT sum, float *DISTI_RESTRICT d,
-                                            float *DISTI_RESTRICT bend)
-{
-    for (size_t c = 0; c < count; c++) {
-        const float slope = d[c], curvature = bend[c];
-        d[c] = disti_finite(sum[c]) ? slope : 0.0f;
-        bend[c] = disti_finite(sum[c]) ? curvature : 0.0f;
     }
 }
 
@@ -6701,8 +6697,7 @@ static void disti_net_output(const dist_shape *shape, const disti_block *b, cons
         v[c] = disti_sigmoid(v[c]);
         if (!b->values) d[c] = slope, bend[c] = slope * (1.0f - 2.0f * v[c]);
     }
-    if (!b->values) disti_output_slopes(count, value, d, bend);
-    disti_output_values(count, channel == net->sdf_channel ? net->level : 0.0f, v, value);
+    disti_output_end(count, channel == net->sdf_channel ? net->level : 0.0f, v, value, b->values ? NULL : d, bend);
 }
 
 /* delta of layer l's output (after the activation) to that of its pre-activation, in place. ReLU's mask is in it

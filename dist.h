@@ -16191,7 +16191,14 @@ static void disti_cases(disti_case *cases)
 
 enum { DISTI_MESH_BATCH = 8192 };
 
-/* The cube is walked layer by layer; a plane holds (cells + 1)^2 corners and everything that hangs on them. */
+/* (cells + 1)^2 corners of one height, and what hangs on them. */
+typedef struct disti_extract_plane {
+    float *value;
+    unsigned char *known; /* 1: value is there */
+    unsigned *edge[3];    /* [axis]: vertex on the edge from this corner along the axis; ~0 none yet */
+} disti_extract_plane;
+
+/* The cube is walked layer by layer. */
 typedef struct disti_extract {
     dist_context *ctx;
     const dist_field *field;
@@ -16202,13 +16209,10 @@ typedef struct disti_extract {
     size_t block;       /* cells along a block's side; blocks are left out as a whole */
     size_t blocks;      /* along a side of the cube */
     int no_skip;
-    float *value[2];         /* f - level's f at the layer's lower and upper corners */
-    unsigned char *known[2]; /* 1: value is there */
-    unsigned *edge[2][2];    /* [layer][axis]: vertex on the edge from this corner along x or y; ~0 none yet */
-    unsigned *upright;       /* ... along z, from lower to upper */
-    unsigned char *active;   /* (blocks, blocks) of the blocks that the layer cuts; 1: may hold the surface */
-    float *batch;            /* (DISTI_MESH_BATCH, 15) */
-    unsigned *where;         /* (DISTI_MESH_BATCH) */
+    disti_extract_plane plane[2]; /* the layer's lower and upper corners */
+    unsigned char *active; /* (blocks, blocks) of the blocks that the layer cuts; 1: may hold the surface */
+    float *batch;          /* (DISTI_MESH_BATCH, 15) */
+    unsigned *where;       /* (DISTI_MESH_BATCH) */
     void *memory;
     size_t memory_bytes;
 } disti_extract;
@@ -16263,37 +16267,36 @@ static int disti_extract_mark(disti_extract *x, size_t slab)
     return 1;
 }
 
-static int disti_extract_flush(disti_extract *x, int layer, size_t n)
+static int disti_extract_flush(disti_extract *x, const disti_extract_plane *plane, size_t n)
 {
     if (n == 0) return 1;
     if (!disti_extract_eval(x, n)) return 0;
-    for (size_t i = 0; i < n; i++) x->value[layer][x->where[i]] = x->batch[3 * DISTI_MESH_BATCH + i];
+    for (size_t i = 0; i < n; i++) plane->value[x->where[i]] = x->batch[3 * DISTI_MESH_BATCH + i];
     return 1;
 }
 
-/* Evaluates the corners of active blocks in one of the two corner layers, which stands at height z. */
-static int disti_extract_fill(disti_extract *x, int layer, size_t z)
+/* Evaluates the plane's corners of active blocks, at height z. */
+static int disti_extract_fill(disti_extract *x, const disti_extract_plane *plane, size_t z)
 {
     size_t n = 0;
-    unsigned char *known = x->known[layer];
     float height = disti_extract_coordinate(x, 2, (double)z);
     for (size_t b = 0; b < x->blocks * x->blocks; b++) {
         if (!x->active[b]) continue;
         size_t x0 = b % x->blocks * x->block, y0 = b / x->blocks * x->block;
         size_t x1 = DISTI_MIN(x0 + x->block, x->cells), y1 = DISTI_MIN(y0 + x->block, x->cells);
         for (size_t i = y0 * x->side + x0; i <= y1 * x->side + x1; i += i % x->side == x1 ? x->side - (x1 - x0) : 1) {
-            if (known[i]) continue;
-            known[i] = 1;
+            if (plane->known[i]) continue;
+            plane->known[i] = 1;
             x->where[n] = (unsigned)i;
             x->batch[3 * n] = disti_extract_coordinate(x, 0, (double)(i % x->side));
             x->batch[3 * n + 1] = disti_extract_coordinate(x, 1, (double)(i / x->side));
             x->batch[3 * n + 2] = height;
             if (++n < DISTI_MESH_BATCH) continue;
-            if (!disti_extract_flush(x, layer, n)) return 0;
+            if (!disti_extract_flush(x, plane, n)) return 0;
             n = 0;
         }
     }
-    return disti_extract_flush(x, layer, n);
+    return disti_extract_flush(x, plane, n);
 }
 
 /* The vertex on an edge of the cell at (cx, cy, cz), made where it is asked for first; 0 after disti_fail. */
@@ -16303,9 +16306,10 @@ static int disti_extract_vertex(disti_extract *x, int edge, const size_t cell[3]
     size_t step[3] = {1, x->side, 0}, corner[3];
     for (int k = 0; k < 3; k++) corner[k] = cell[k] + (size_t)(edge >> k & 1);
     size_t at = corner[1] * x->side + corner[0];
-    unsigned *slot = axis == 2 ? x->upright + at : x->edge[layer][axis] + at;
+    unsigned *slot = x->plane[layer].edge[axis] + at;
     if (*slot == ~0u) {
-        double low = (double)x->value[layer][at], high = (double)x->value[axis == 2 ? 1 : layer][at + step[axis]];
+        double low = (double)x->plane[layer].value[at];
+        double high = (double)x->plane[axis == 2 ? 1 : layer].value[at + step[axis]];
         double t = ((double)x->level - low) / (high - low); /* one is below the level, the other is not */
         float p[3];
         for (int k = 0; k < 3; k++) p[k] = disti_extract_coordinate(x, k, (double)corner[k] + (k == axis ? t : 0.0));
@@ -16321,7 +16325,7 @@ static int disti_extract_cell(disti_extract *x, const size_t cell[3])
     int code = 0;
     size_t at = cell[1] * x->side + cell[0];
     for (int c = 0; c < 8; c++)
-        code |= (x->value[c >> 2][at + (size_t)(c >> 1 & 1) * x->side + (size_t)(c & 1)] < x->level) << c;
+        code |= (x->plane[c >> 2].value[at + (size_t)(c >> 1 & 1) * x->side + (size_t)(c & 1)] < x->level) << c;
     const disti_case *found = x->cases + code;
     for (int i = 0; i < found->triangles; i++) {
         unsigned v[3];
@@ -16347,29 +16351,12 @@ static int disti_extract_layer(disti_extract *x, size_t z)
     return 1;
 }
 
-/* Nothing is known yet of a corner layer and of what stands on it. */
-static void disti_extract_forget(disti_extract *x, int layer)
+/* Nothing is known yet of a plane. */
+static void disti_extract_forget(const disti_extract *x, const disti_extract_plane *plane)
 {
-    size_t plane = x->side * x->side;
-    memset(x->known[layer], 0, plane);
-    for (int axis = 0; axis < 2; axis++) memset(x->edge[layer][axis], 0xff, plane * sizeof(unsigned));
-    memset(x->upright, 0xff, plane * sizeof(unsigned));
-}
-
-/* What was the upper corner layer becomes the lower one. */
-static void disti_extract_advance(disti_extract *x)
-{
-    float *value = x->value[0];
-    unsigned char *known = x->known[0];
-    unsigned *edge[2];
-    memcpy(edge, x->edge[0], sizeof edge);
-    memcpy(x->edge[0], x->edge[1], sizeof edge);
-    memcpy(x->edge[1], edge, sizeof edge);
-    x->value[0] = x->value[1];
-    x->value[1] = value;
-    x->known[0] = x->known[1];
-    x->known[1] = known;
-    disti_extract_forget(x, 1);
+    size_t corners = x->side * x->side;
+    memset(plane->known, 0, corners);
+    for (int axis = 0; axis < 3; axis++) memset(plane->edge[axis], 0xff, corners * sizeof(unsigned));
 }
 
 static int disti_extract_surface(disti_extract *x)
@@ -16377,10 +16364,13 @@ static int disti_extract_surface(disti_extract *x)
     for (size_t z = 0; z < x->cells; z++) {
         if (z % x->block == 0) {
             /* a block below may have been left out: the shared corners are then still to be evaluated */
-            if (!disti_extract_mark(x, z / x->block) || !disti_extract_fill(x, 0, z)) return 0;
+            if (!disti_extract_mark(x, z / x->block) || !disti_extract_fill(x, &x->plane[0], z)) return 0;
         }
-        if (!disti_extract_fill(x, 1, z + 1) || !disti_extract_layer(x, z)) return 0;
-        disti_extract_advance(x);
+        if (!disti_extract_fill(x, &x->plane[1], z + 1) || !disti_extract_layer(x, z)) return 0;
+        disti_extract_plane lower = x->plane[0];
+        x->plane[0] = x->plane[1];
+        x->plane[1] = lower;
+        disti_extract_forget(x, &x->plane[1]);
     }
     return 1;
 }
@@ -16421,19 +16411,19 @@ static void disti_extract_polish(disti_extract *x, size_t n, int steps, float *v
     }
 }
 
-/* One block for all planes: at most 2049^2 of 30 bytes, and the batch: fits 32 bits. base NULL: only its size. */
+/* One block for all planes: at most 2049^2 of 34 bytes, and the batch: fits 32 bits. base NULL: only its size. */
 static size_t disti_extract_layout(disti_extract *x, unsigned char *base)
 {
-    size_t at = 0, plane = x->side * x->side;
+    size_t at = 0, corners = x->side * x->side;
     x->batch = (float *)disti_take(base, &at, 15 * DISTI_MESH_BATCH, sizeof(float));
     x->where = (unsigned *)disti_take(base, &at, DISTI_MESH_BATCH, sizeof(unsigned));
     for (int layer = 0; layer < 2; layer++) {
-        x->value[layer] = (float *)disti_take(base, &at, plane, sizeof(float));
-        x->known[layer] = (unsigned char *)disti_take(base, &at, plane, 1);
-        for (int axis = 0; axis < 2; axis++)
-            x->edge[layer][axis] = (unsigned *)disti_take(base, &at, plane, sizeof(unsigned));
+        disti_extract_plane *plane = &x->plane[layer];
+        plane->value = (float *)disti_take(base, &at, corners, sizeof(float));
+        plane->known = (unsigned char *)disti_take(base, &at, corners, 1);
+        for (int axis = 0; axis < 3; axis++)
+            plane->edge[axis] = (unsigned *)disti_take(base, &at, corners, sizeof(unsigned));
     }
-    x->upright = (unsigned *)disti_take(base, &at, plane, sizeof(unsigned));
     x->active = (unsigned char *)disti_take(base, &at, x->blocks * x->blocks, 1);
     return at;
 }
@@ -16444,7 +16434,7 @@ static int disti_extract_begin(disti_extract *x)
     x->memory = disti_alloc(x->ctx, x->memory_bytes);
     if (!x->memory) return 0;
     disti_extract_layout(x, (unsigned char *)x->memory);
-    for (int layer = 0; layer < 2; layer++) disti_extract_forget(x, layer);
+    for (int layer = 0; layer < 2; layer++) disti_extract_forget(x, &x->plane[layer]);
     return 1;
 }
 

@@ -15188,6 +15188,21 @@ static void disti_add_pull(disti_render_backward_job *job, const double p[3], co
     }
 }
 
+/* disti_add_pull of dL/dpoint at p, of which nothing counts that is not finite; returns dL/dt of p = o + t v. */
+static float disti_backward_hit(disti_render_backward_job *job, const float *p, const float *d_point, const float v[3],
+                                float d_z)
+{
+    double point[3], y[3], d_distance = 0.0;
+    if (!disti_finite_all(3, d_point)) return 0.0f;
+    for (int i = 0; i < 3; i++) {
+        point[i] = (double)p[i];
+        y[i] = (double)d_point[i];
+        d_distance += y[i] * (double)v[i];
+    }
+    disti_add_pull(job, point, y, (double)d_z);
+    return (float)d_distance;
+}
+
 /* Pieces that the entries are cut into before each is put in order by itself. */
 enum { DISTI_PIECE = 4 * (int)DISTI_GROUP_POINTS };
 
@@ -15233,14 +15248,9 @@ static void disti_backward_flush(disti_render_backward_job *job)
     for (size_t i = 0; i < job->count; i++) {
         const disti_entry *entry = &tape->entry[i];
         job->capped += entry->capped;
-        if (!job->camera) continue;
-        double p[3], y[3];
-        for (size_t k = 0; k < 3; k++) {
-            p[k] = (double)tape->points[3 * i + k];
-            y[k] = (double)tape->d_points[3 * i + k];
-        }
-        if (disti_finite_all(3, tape->d_points + 3 * i))
-            disti_add_pull(job, p, y, (double)(entry->weight * entry->d_depth));
+        if (job->camera)
+            disti_backward_hit(job, tape->points + 3 * i, tape->d_points + 3 * i, entry->direction,
+                               entry->weight * entry->d_depth);
     }
     job->points += job->count;
     job->count = 0;
@@ -15258,21 +15268,6 @@ static void disti_backward_add(disti_render_backward_job *job, const disti_ray *
     memcpy(entry->direction, ray->direction, sizeof entry->direction);
     memcpy(tape->points + 3 * job->count, point, 3 * sizeof(float));
     if (++job->count == DISTI_CHUNK) disti_backward_flush(job);
-}
-
-/* What dL/dpoint at the hit p = o + t v gives: the pull on the camera at this t; returns dL/dt. */
-static float disti_backward_hit(disti_render_backward_job *job, const disti_ray *ray, const float *p,
-                                const float *d_point)
-{
-    double point[3], y[3], d_distance = 0.0;
-    if (!disti_finite_all(3, d_point)) return 0.0f;
-    for (int i = 0; i < 3; i++) {
-        point[i] = (double)p[i];
-        y[i] = (double)d_point[i];
-        d_distance += y[i] * (double)ray->direction[i];
-    }
-    disti_add_pull(job, point, y, 0.0);
-    return (float)d_distance;
 }
 
 /* The ray of a pixel, and the point p of it that the tape keeps. */
@@ -15295,7 +15290,7 @@ static void disti_backward_pixel(disti_render_backward_job *job, size_t pixel, f
     unsigned char status = tape->status[pixel];
     disti_ray ray;
     double local[3], nearest[3], pull[3];
-    float p[3];
+    float p[3], none[3] = {0.0f, 0.0f, 0.0f};
     int paper = tracer->how.gradient == DIST_GRADIENT_PAPER;
     if (!job->camera && !(status & (DISTI_TAPE_HIT | DISTI_TAPE_SAMPLE))) return; /* off the sphere, most often */
     disti_tape_ray(job, pixel, local, &ray, p);
@@ -15310,13 +15305,12 @@ static void disti_backward_pixel(disti_render_backward_job *job, size_t pixel, f
     if (status & DISTI_TAPE_SOLID) d_silhouette = -d_silhouette;
     d_distance += d_depth * (float)local[2];
     if (paper) { /* the tilt's share, which in the other modes goes with the hit's entry */
-        for (int i = 0; i < 3; i++) nearest[i] = (double)p[i], pull[i] = 0.0;
-        disti_add_pull(job, nearest, pull, (double)d_depth);
+        disti_backward_hit(job, p, none, ray.direction, d_depth);
         d_depth = 0.0f;
     }
-    float d_motion = d_point ? disti_backward_hit(job, &ray, p, d_point) : 0.0f;
+    float d_motion = d_point ? disti_backward_hit(job, p, d_point, ray.direction, 0.0f) : 0.0f;
     if (paper) d_distance += d_motion, d_motion = 0.0f;
-    float bends = d_bend ? disti_backward_hit(job, &ray, p, d_bend) : 0.0f;
+    float bends = d_bend ? disti_backward_hit(job, p, d_bend, ray.direction, 0.0f) : 0.0f;
     if (!paper) d_motion += bends;
     if (tape->sample) {
         const float *samples = tape->sample + pixel * (size_t)tape->samples * 4;

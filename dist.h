@@ -16710,14 +16710,12 @@ static void disti_tree_search(const disti_tree *tree, size_t node, size_t low, s
 {
     if (2 * node + 2 < tree->nodes) {
         size_t middle = low + (high - low) / 2, child = 2 * node + 1;
-        double left = disti_box_distance(tree->boxes + 6 * child, p);
-        double right = disti_box_distance(tree->boxes + 6 * child + 6, p);
+        double away[2] = {disti_box_distance(tree->boxes + 6 * child, p),
+                          disti_box_distance(tree->boxes + 6 * child + 6, p)};
         for (int k = 0; k < 2; k++) {
-            if ((right < left) == (k == 0)) {
-                if (right < *best) disti_tree_search(tree, child + 1, middle, high, p, best, hint);
-            } else if (left < *best) {
-                disti_tree_search(tree, child, low, middle, p, best, hint);
-            }
+            int side = k ^ (away[1] < away[0]);
+            if (away[side] < *best)
+                disti_tree_search(tree, child + (size_t)side, side ? middle : low, side ? high : middle, p, best, hint);
         }
         return;
     }
@@ -16727,14 +16725,6 @@ static void disti_tree_search(const disti_tree *tree, size_t node, size_t low, s
         *best = d;
         *hint = i;
     }
-}
-
-/* Squared distance from p to its nearest point; *hint is a guess at that point, in, and it, out. */
-static double disti_tree_nearest(const disti_tree *tree, const float *p, size_t *hint)
-{
-    double best = disti_square_distance(tree->points + 3 * *hint, p);
-    disti_tree_search(tree, 0, 0, tree->n, p, &best, hint);
-    return best;
 }
 
 typedef struct disti_chamfer_job {
@@ -16751,7 +16741,11 @@ static void disti_chamfer_task(void *arg, int index, int worker)
     size_t first, n = disti_piece(&job->pieces, index, &first), hint = 0;
     double sum = 0.0;
     (void)worker;
-    for (size_t i = first; i < first + n; i++) sum += disti_tree_nearest(job->to, job->from->points + 3 * i, &hint);
+    for (const float *p = job->from->points + 3 * first; n-- > 0; p += 3) {
+        double best = disti_square_distance(job->to->points + 3 * hint, p);
+        disti_tree_search(job->to, 0, 0, job->to->n, p, &best, &hint);
+        sum += best;
+    }
     job->sums[index] = sum;
 }
 

@@ -13451,12 +13451,11 @@ DIST_API dist_tape *dist_tape_create(dist_context *ctx, const dist_camera *camer
     return tape;
 }
 
-/* Ray of pixel (x, y), unit direction in camera space in `local`. */
-static void disti_pixel_ray(const disti_view *view, const dist_field *field, int x, int y, double local[3],
-                            disti_ray *ray)
+static void disti_pixel_ray(const disti_view *view, const dist_field *field, size_t pixel, disti_ray *ray)
 {
-    double world[3];
-    disti_view_direction(view, x, y, local);
+    double local[3], world[3];
+    size_t width = (size_t)view->width;
+    disti_view_direction(view, (double)(pixel % width), (double)(pixel / width), local);
     disti_rotate_back(view->rotation, local, world);
     disti_ray_init(field, view->center, world, disti_view_footprint(view, local[2]), ray);
     ray->cosine = (float)local[2];
@@ -14930,7 +14929,7 @@ static void disti_render_list_task(void *arg, int index, int worker)
     disti_tile tile;
     disti_ray skipped;
     disti_budget budget;
-    double local[3], done = (double)index * (double)job->each;
+    double done = (double)index * (double)job->each;
     disti_bench_init(tracer->ctx, worker, &bench);
     if (tracer->how.max_queries > 0) bench.budget = &budget;
     disti_ray_skip(&skipped);
@@ -14944,8 +14943,7 @@ static void disti_render_list_task(void *arg, int index, int worker)
             disti_render_pixel(job, &skipped, i);
             if (!tracer->how.pixels[i]) continue;
             list[tile.width] = i;
-            disti_pixel_ray(job->view, tracer->field, (int)(i % (size_t)job->view->width),
-                            (int)(i / (size_t)job->view->width), local, &bench.rays[tile.width++]);
+            disti_pixel_ray(job->view, tracer->field, i, &bench.rays[tile.width++]);
         }
         disti_budget_init(job, done, (double)tile.width, (double)job->count * (double)job->each, &budget);
         budget.marching = 1;
@@ -14981,14 +14979,14 @@ static float disti_render_change(disti_tracer *tracer, const disti_view *view, d
     enum { SIDE = 32 };
     int dx = DISTI_MAX((view->width + SIDE - 1) / SIDE, 4), dy = DISTI_MAX((view->height + SIDE - 1) / SIDE, 4);
     size_t count = 0;
-    double local[3], sum = 0.0;
+    double sum = 0.0;
     disti_bench bench;
     for (int y = dy / 2; y < view->height; y += dy) {
         for (int x = dx / 2; x < view->width; x += dx) {
             size_t pixel = (size_t)y * (size_t)view->width + (size_t)x;
             disti_ray ray;
             if (!(tape->status[pixel] & DISTI_TAPE_HIT)) continue;
-            disti_pixel_ray(view, tracer->field, x, y, local, &ray);
+            disti_pixel_ray(view, tracer->field, pixel, &ray);
             disti_ray_point(&ray, tape->s[pixel], tape->points + 3 * count++);
         }
     }
@@ -15271,13 +15269,10 @@ static void disti_backward_add(disti_render_backward_job *job, const disti_ray *
 }
 
 /* The ray of a pixel, and the point p of it that the tape keeps. */
-static void disti_tape_ray(const disti_render_backward_job *job, size_t pixel, double local[3], disti_ray *ray,
-                           float *p)
+static void disti_tape_ray(const disti_render_backward_job *job, size_t pixel, disti_ray *ray, float *p)
 {
-    const dist_tape *tape = job->tape;
-    size_t width = (size_t)tape->width;
-    disti_pixel_ray(&job->view, &tape->field, (int)(pixel % width), (int)(pixel / width), local, ray);
-    disti_ray_point(ray, tape->s[pixel], p);
+    disti_pixel_ray(&job->view, &job->tape->field, pixel, ray);
+    disti_ray_point(ray, job->tape->s[pixel], p);
 }
 
 /* One pixel with an upstream gradient; d_point and d_bend: dL/dpoint at its hit by its color and normal, or NULL. */
@@ -15289,11 +15284,11 @@ static void disti_backward_pixel(disti_render_backward_job *job, size_t pixel, f
     const disti_tracer *tracer = &tape->tracer;
     unsigned char status = tape->status[pixel];
     disti_ray ray;
-    double local[3], nearest[3], pull[3];
+    double nearest[3], pull[3];
     float p[3], none[3] = {0.0f, 0.0f, 0.0f};
     int paper = tracer->how.gradient == DIST_GRADIENT_PAPER;
     if (!job->camera && !(status & (DISTI_TAPE_HIT | DISTI_TAPE_SAMPLE))) return; /* off the sphere, most often */
-    disti_tape_ray(job, pixel, local, &ray, p);
+    disti_tape_ray(job, pixel, &ray, p);
     if (ray.enter >= ray.leave) { /* off the sphere: only the camera feels it */
         disti_ray_nearest(field, &ray, nearest, pull);
         disti_normalize(pull);
@@ -15303,7 +15298,7 @@ static void disti_backward_pixel(disti_render_backward_job *job, size_t pixel, f
     }
     if (!(status & DISTI_TAPE_SAMPLE)) d_silhouette = 0.0f;
     if (status & DISTI_TAPE_SOLID) d_silhouette = -d_silhouette;
-    d_distance += d_depth * (float)local[2];
+    d_distance += d_depth * ray.cosine;
     if (paper) { /* the tilt's share, which in the other modes goes with the hit's entry */
         disti_backward_hit(job, p, none, ray.direction, d_depth);
         d_depth = 0.0f;
@@ -15351,9 +15346,8 @@ static size_t disti_backward_hits(const disti_render_backward_job *job, const fl
     size_t n = 0;
     for (size_t pixel = first; pixel < first + count; pixel++) {
         disti_ray ray;
-        double local[3];
         if (!disti_upstream_three(job, plane, pixel, d + 3 * n)) continue;
-        disti_tape_ray(job, pixel, local, &ray, tape->hit + 3 * n++);
+        disti_tape_ray(job, pixel, &ray, tape->hit + 3 * n++);
     }
     return n;
 }
@@ -15465,11 +15459,10 @@ static void disti_backward_outline(disti_render_backward_job *job, size_t first,
     const dist_render_desc *how = &tape->tracer.how;
     float *p = tape->hit, *surface = tape->d_points, *color = tape->pull, *seed = tape->d_color, d_color[3];
     disti_ray ray;
-    double local[3];
     size_t n = 0;
     for (size_t pixel = first; pixel < first + count; pixel++) {
         if (!(tape->status[pixel] & DISTI_TAPE_NEAR)) continue;
-        disti_tape_ray(job, pixel, local, &ray, p + 3 * n);
+        disti_tape_ray(job, pixel, &ray, p + 3 * n);
         if (tape->sample) memcpy(p + 3 * n, tape->sample + pixel * (size_t)tape->samples * 4 + 1, 3 * sizeof(float));
         n++;
     }

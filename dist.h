@@ -15109,7 +15109,6 @@ typedef struct disti_render_backward_job {
     double *total, *d_code; /* of both codes, and of the first where it is wanted */
     unsigned long long capped, points, skipped;
     size_t count;
-    size_t colored, bent; /* of this run's hits with d_color and d_normal, how many the pixels so far have taken */
     int camera, geometry; /* a gradient of the camera, one that depends on where the hit is at all, is wanted */
 } disti_render_backward_job;
 
@@ -15376,7 +15375,6 @@ static void disti_backward_normals(disti_render_backward_job *job, size_t first,
     const dist_render_desc *how = &tape->tracer.how;
     disti_normals_job gradients;
     size_t n = disti_backward_hits(job, job->d_out->normal, first, count, tape->bend), stencil = 2;
-    job->bent = 0;
     if (n == 0) return;
     if (how->normal_mode == DIST_NORMAL_DIFFERENCE) stencil = 6;
     else if (field->second_fn && !field->kinks && (!job->grads->weights || field->second_weights_fn)) stencil = 0;
@@ -15421,7 +15419,6 @@ static void disti_backward_colors(disti_render_backward_job *job, size_t first, 
     disti_color_backward_all(job->ctx, field, n, tape->hit, tape->d_color, job->geometry ? tape->pull : NULL,
                              job->grads, job->total);
     job->points += n;
-    job->colored = 0;
 }
 
 /* dL/dcolor between pixels, bilinear, at the place where point p is seen. */
@@ -15485,35 +15482,33 @@ static void disti_backward_outline(disti_render_backward_job *job, size_t first,
         if (seed[i] != 0.0f) disti_backward_add(job, &ray, p + 3 * i, 0.0f, 0.0f, 0.0f, seed[i]);
 }
 
-static void disti_backward_pixels(disti_render_backward_job *job)
+/* `count` pixels, at most DISTI_RUN. */
+static void disti_backward_pixels(disti_render_backward_job *job, size_t first, size_t count)
 {
     const dist_tape *tape = job->tape;
     const dist_images *d_out = job->d_out;
-    size_t pixels = (size_t)tape->width * (size_t)tape->height;
-    for (size_t pixel = 0; pixel < pixels; pixel++) {
-        int hit = tape->status[pixel] & DISTI_TAPE_HIT;
+    const float *pull = tape->pull, *bend = tape->bend; /* of the next hit that has an upstream gradient */
+    if (d_out->color && job->geometry && tape->tracer.how.relax_band > 0.0f) disti_backward_outline(job, first, count);
+    if (d_out->color) disti_backward_colors(job, first, count);
+    if (d_out->normal && job->geometry) disti_backward_normals(job, first, count);
+    for (size_t pixel = first; pixel < first + count; pixel++) {
+        int hit = tape->status[pixel] & DISTI_TAPE_HIT, asked = tape->status[pixel] != DIST_RAY_SKIPPED;
         float d_depth = hit ? disti_upstream(d_out->depth, pixel) : 0.0f;
         float d_distance = hit ? disti_upstream(d_out->distance, pixel) : 0.0f;
-        int asked = tape->status[pixel] != DIST_RAY_SKIPPED;
         float d_silhouette = asked ? disti_upstream(d_out->silhouette, pixel) : 0.0f;
         float d[3];
-        if (job->geometry && d_out->color && tape->tracer.how.relax_band > 0.0f && pixel % DISTI_RUN == 0)
-            disti_backward_outline(job, pixel, DISTI_MIN(pixels - pixel, (size_t)DISTI_RUN));
-        if (d_out->color && pixel % DISTI_RUN == 0)
-            disti_backward_colors(job, pixel, DISTI_MIN(pixels - pixel, (size_t)DISTI_RUN));
-        if (d_out->normal && job->geometry && pixel % DISTI_RUN == 0)
-            disti_backward_normals(job, pixel, DISTI_MIN(pixels - pixel, (size_t)DISTI_RUN));
         int colored = disti_upstream_three(job, d_out->color, pixel, d);
         int normal = disti_upstream_three(job, d_out->normal, pixel, d);
         if (d_depth == 0.0f && d_distance == 0.0f && d_silhouette == 0.0f && !normal && !colored) {
             job->skipped++;
             continue;
         }
-        const float *d_point = colored ? tape->pull + 3 * job->colored++ : NULL;
-        const float *d_bend = normal ? tape->bend + 3 * job->bent++ : NULL;
-        if (job->geometry) disti_backward_pixel(job, pixel, d_depth, d_distance, d_silhouette, d_point, d_bend);
+        if (job->geometry)
+            disti_backward_pixel(job, pixel, d_depth, d_distance, d_silhouette, colored ? pull : NULL,
+                                 normal ? bend : NULL);
+        pull += colored ? 3 : 0;
+        bend += normal ? 3 : 0;
     }
-    disti_backward_flush(job);
 }
 
 DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *tape, const dist_images *d_out,
@@ -15550,7 +15545,11 @@ DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *ta
     memset(job.total, 0, size * sizeof(double));
     if (grads->code) job.d_code = job.total;
     unsigned state = disti_float_state_enter(); /* also for what is not in disti_run */
-    if (job.geometry || grads->color_code || grads->color_weights) disti_backward_pixels(&job);
+    size_t pixels = (size_t)tape->width * (size_t)tape->height;
+    if (!job.geometry && !grads->color_code && !grads->color_weights) pixels = 0; /* nothing is wanted */
+    for (size_t first = 0; first < pixels; first += DISTI_RUN)
+        disti_backward_pixels(&job, first, DISTI_MIN(pixels - first, (size_t)DISTI_RUN));
+    disti_backward_flush(&job);
     disti_float_state_leave(state);
     disti_codes_add(&tape->field, grads, job.total);
     for (int i = 0; i < 3; i++) {

@@ -16199,8 +16199,6 @@ typedef struct disti_extract {
     unsigned char *active; /* (blocks, blocks) of the blocks that the layer cuts; 1: may hold the surface */
     float *batch;          /* (DISTI_MESH_BATCH, 15) */
     unsigned *where;       /* (DISTI_MESH_BATCH) */
-    void *memory;
-    size_t memory_bytes;
 } disti_extract;
 
 static float disti_extract_coordinate(const disti_extract *x, int axis, double cells)
@@ -16347,6 +16345,7 @@ static void disti_extract_forget(const disti_extract *x, const disti_extract_pla
 
 static int disti_extract_surface(disti_extract *x)
 {
+    for (int layer = 0; layer < 2; layer++) disti_extract_forget(x, &x->plane[layer]);
     for (size_t z = 0; z < x->cells; z++) {
         if (z % x->block == 0) {
             /* a block below may have been left out: the shared corners are then still to be evaluated */
@@ -16414,16 +16413,6 @@ static size_t disti_extract_layout(disti_extract *x, unsigned char *base)
     return at;
 }
 
-static int disti_extract_begin(disti_extract *x)
-{
-    x->memory_bytes = disti_extract_layout(x, NULL);
-    x->memory = disti_alloc(x->ctx, x->memory_bytes);
-    if (!x->memory) return 0;
-    disti_extract_layout(x, (unsigned char *)x->memory);
-    for (int layer = 0; layer < 2; layer++) disti_extract_forget(x, &x->plane[layer]);
-    return 1;
-}
-
 /* Blocks of 4 cells, of 2 where a clamped field could never rule one out; if these are still too large, all cells. */
 static void disti_extract_blocks(disti_extract *x)
 {
@@ -16456,9 +16445,7 @@ DIST_API dist_mesh *dist_mesh_extract(dist_context *ctx, const dist_field *field
     disti_extract x;
     disti_case cases[256];
     dist_mesh_desc d;
-    int good = 0;
-    if (disti_enter(ctx) != DIST_OK || disti_extract_check(ctx, field, desc) != DIST_OK)
-        return NULL;
+    if (disti_enter(ctx) != DIST_OK || disti_extract_check(ctx, field, desc) != DIST_OK) return NULL;
     memset(&d, 0, sizeof d);
     if (desc) d = *desc;
     memset(&x, 0, sizeof x);
@@ -16472,7 +16459,10 @@ DIST_API dist_mesh *dist_mesh_extract(dist_context *ctx, const dist_field *field
     disti_extract_blocks(&x);
     disti_cases(cases);
     x.mesh = disti_mesh_new(ctx);
-    good = x.mesh && disti_extract_begin(&x) && disti_extract_surface(&x);
+    size_t bytes = disti_extract_layout(&x, NULL);
+    void *memory = x.mesh ? disti_alloc(ctx, bytes) : NULL;
+    disti_extract_layout(&x, (unsigned char *)memory);
+    int good = memory && disti_extract_surface(&x);
     if (good && d.normals) {
         x.mesh->normals = (float *)disti_alloc(ctx, x.mesh->vertex_capacity * 3 * sizeof(float)); /* as the vertices */
         good = x.mesh->normals != NULL;
@@ -16480,7 +16470,7 @@ DIST_API dist_mesh *dist_mesh_extract(dist_context *ctx, const dist_field *field
     for (size_t at = 0; good && (d.refine || d.normals) && at < x.mesh->vertex_count; at += DISTI_MESH_BATCH)
         disti_extract_polish(&x, DISTI_MIN(x.mesh->vertex_count - at, (size_t)DISTI_MESH_BATCH), d.refine,
                              x.mesh->vertices + 3 * at, d.normals ? x.mesh->normals + 3 * at : NULL);
-    disti_free(ctx, x.memory, x.memory_bytes);
+    disti_free(ctx, memory, bytes);
     if (good) return x.mesh;
     dist_mesh_destroy(x.mesh);
     return NULL;

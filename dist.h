@@ -16834,22 +16834,6 @@ static int disti_text_number(disti_text *t, double *out)
     return 1;
 }
 
-static dist_status disti_pfm_check(dist_context *ctx, const char *name, int width, int height, int channels,
-                                   size_t *floats)
-{
-    dist_status status = disti_enter(ctx);
-    if (status != DIST_OK) return status;
-    if (width < 1 || height < 1)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: the picture is %d x %d, must be at least 1 x 1", name, width,
-                          height);
-    if (channels != 1 && channels != 3)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: channels is %d, must be 1 or 3", name, channels, 0);
-    if (!disti_size_mul((size_t)width, (size_t)height, floats) || !disti_size_mul(*floats, (size_t)channels, floats) ||
-        *floats > ((size_t)-1 - 64) / 4)
-        return disti_fail(ctx, DIST_OUT_OF_MEMORY, "%s: %d x %d pixels do not fit memory", name, width, height);
-    return DIST_OK;
-}
-
 DIST_API dist_status dist_pfm_write(dist_context *ctx, int width, int height, int channels, const float *pixels,
                                     void *buffer, size_t capacity, size_t *size)
 {
@@ -16857,8 +16841,16 @@ DIST_API dist_status dist_pfm_write(dist_context *ctx, int width, int height, in
     size_t floats = 0;
     unsigned char header[64];
     disti_writer sink = {header, 0};
-    dist_status status = disti_pfm_check(ctx, name, width, height, channels, &floats);
+    dist_status status = disti_enter(ctx);
     if (status != DIST_OK) return status;
+    if (width < 1 || height < 1)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: the picture is %d x %d, must be at least 1 x 1", name, width,
+                          height);
+    if (channels != 1 && channels != 3)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: channels is %d, must be 1 or 3", name, channels, 0);
+    if (!disti_size_mul((size_t)width, (size_t)height, &floats) ||
+        !disti_size_mul(floats, (size_t)channels, &floats) || floats > ((size_t)-1 - 64) / 4)
+        return disti_fail(ctx, DIST_OUT_OF_MEMORY, "%s: %d x %d pixels do not fit memory", name, width, height);
     if (!size) return disti_refuse(ctx, "%s: size is NULL", name);
     disti_put_text(&sink, channels == 3 ? "PF\n" : "Pf\n");
     disti_put_size(&sink, (size_t)width);

@@ -16592,8 +16592,8 @@ DIST_API dist_status dist_mesh_sample(dist_context *ctx, const dist_mesh *mesh, 
    equal points, lines and outliers cost nothing extra; the tight boxes do the pruning. */
 typedef struct disti_tree {
     float *points; /* (n, 3), permuted */
-    float *boxes;  /* (nodes, 6): low, high */
-    size_t n, nodes;
+    float *boxes;  /* (nodes, 6): low, high; behind the points */
+    size_t n, nodes, bytes;
     int depth;
 } disti_tree;
 
@@ -16648,25 +16648,19 @@ static void disti_tree_build(disti_tree *tree, size_t node, size_t low, size_t h
 /* Copies and sorts n > 0 points; leaves hold 4 to 8. 0 after disti_fail. */
 static int disti_tree_begin(dist_context *ctx, disti_tree *tree, size_t n, const float *points)
 {
-    size_t point_bytes, box_bytes;
+    size_t floats;
     tree->n = n;
     while (n >> tree->depth > 8) tree->depth++;
-    tree->nodes = ((size_t)2 << tree->depth) - 1;
-    disti_size_mul(n, 3 * sizeof(float), &point_bytes);
-    disti_size_mul(tree->nodes, 6 * sizeof(float), &box_bytes);
-    tree->points = (float *)disti_alloc(ctx, point_bytes);
+    tree->nodes = ((size_t)2 << tree->depth) - 1; /* at most n / 2 or 1 */
+    if (!disti_size_mul(n, 3, &floats) || !disti_size_add(floats, 6 * tree->nodes, &floats) ||
+        !disti_size_mul(floats, sizeof(float), &tree->bytes))
+        tree->bytes = (size_t)-1;
+    tree->points = (float *)disti_alloc(ctx, tree->bytes);
     if (!tree->points) return 0;
-    tree->boxes = (float *)disti_alloc(ctx, box_bytes);
-    if (!tree->boxes) return 0;
-    memcpy(tree->points, points, point_bytes);
+    tree->boxes = tree->points + 3 * n;
+    memcpy(tree->points, points, 3 * n * sizeof(float));
     disti_tree_build(tree, 0, 0, n, 0);
     return 1;
-}
-
-static void disti_tree_end(dist_context *ctx, disti_tree *tree)
-{
-    disti_free(ctx, tree->boxes, tree->nodes * 6 * sizeof(float));
-    disti_free(ctx, tree->points, tree->n * 3 * sizeof(float));
 }
 
 static double disti_square_distance(const float *p, const float *q)
@@ -16774,8 +16768,7 @@ DIST_API dist_status dist_chamfer(dist_context *ctx, size_t n, const float *a, s
     if (status == DIST_OK) status = disti_chamfer_one_way(ctx, trees + 1, trees, parts + 1);
     if (status == DIST_OK && chamfer) *chamfer = parts[0] + parts[1];
     if (status == DIST_OK && one_way) memcpy(one_way, parts, sizeof parts);
-    disti_tree_end(ctx, trees + 1);
-    disti_tree_end(ctx, trees);
+    for (int i = 2; i-- > 0;) disti_free(ctx, trees[i].points, trees[i].bytes);
     return status;
 }
 #endif

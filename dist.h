@@ -15109,6 +15109,7 @@ typedef struct disti_render_backward_job {
     double *total, *d_code; /* of both codes, and of the first where it is wanted */
     unsigned long long capped, points, skipped;
     size_t count;
+    disti_pieces pieces; /* of a run's hits with d_normal */
     int camera, geometry; /* a gradient of the camera, one that depends on where the hit is at all, is wanted */
 } disti_render_backward_job;
 
@@ -15351,19 +15352,15 @@ static size_t disti_backward_hits(const disti_render_backward_job *job, const fl
     return n;
 }
 
-typedef struct disti_normals_job {
-    const dist_tape *tape;
-    disti_pieces pieces;
-    float *gradient;
-} disti_normals_job;
-
+/* grad f at the hits, to tape->d_points, which is free until the entries are flushed. */
 static void disti_normals_task(void *arg, int index, int worker)
 {
-    const disti_normals_job *job = (const disti_normals_job *)arg;
+    const disti_render_backward_job *job = (const disti_render_backward_job *)arg;
+    const dist_tape *tape = job->tape;
     disti_bench bench;
     size_t first, n = disti_piece(&job->pieces, index, &first);
-    disti_bench_init(job->tape->ctx, worker, &bench);
-    disti_normal_gradient(&job->tape->tracer, worker, &bench, n, job->tape->hit + 3 * first, job->gradient + 3 * first);
+    disti_bench_init(job->ctx, worker, &bench);
+    disti_normal_gradient(&tape->tracer, worker, &bench, n, tape->hit + 3 * first, tape->d_points + 3 * first);
 }
 
 /* The normals of `count` pixels, at most DISTI_RUN, back to code and weights, to the camera that turns with them, and
@@ -15373,15 +15370,12 @@ static void disti_backward_normals(disti_render_backward_job *job, size_t first,
     const dist_tape *tape = job->tape;
     const dist_field *field = &tape->field;
     const dist_render_desc *how = &tape->tracer.how;
-    disti_normals_job gradients;
     size_t n = disti_backward_hits(job, job->d_out->normal, first, count, tape->bend), stencil = 2;
     if (n == 0) return;
     if (how->normal_mode == DIST_NORMAL_DIFFERENCE) stencil = 6;
     else if (field->second_fn && !field->kinks && (!job->grads->weights || field->second_weights_fn)) stencil = 0;
-    gradients.tape = tape;
-    gradients.pieces = disti_cut(n, 4 * DISTI_BLOCK, 1u << 20);
-    gradients.gradient = tape->d_points; /* free until the entries are flushed */
-    disti_run(job->ctx, gradients.pieces.count, disti_normals_task, &gradients);
+    job->pieces = disti_cut(n, 4 * DISTI_BLOCK, 1u << 20);
+    disti_run(job->ctx, job->pieces.count, disti_normals_task, job);
     for (size_t i = 0; i < n; i++) {
         float *gradient = tape->d_points + 3 * i;
         double g[3], normal[3], d[3], seen[3], torque[3];

@@ -16257,14 +16257,15 @@ static int disti_extract_flush(disti_extract *x, const disti_extract_plane *plan
 static int disti_extract_fill(disti_extract *x, const disti_extract_plane *plane, size_t z)
 {
     size_t n = 0;
+    unsigned char *known = plane->known;
     float height = disti_extract_coordinate(x, 2, (double)z);
     for (size_t b = 0; b < x->blocks * x->blocks; b++) {
         if (!x->active[b]) continue;
         size_t x0 = b % x->blocks * x->block, y0 = b / x->blocks * x->block;
         size_t x1 = DISTI_MIN(x0 + x->block, x->cells), y1 = DISTI_MIN(y0 + x->block, x->cells);
         for (size_t i = y0 * x->side + x0; i <= y1 * x->side + x1; i += i % x->side == x1 ? x->side - (x1 - x0) : 1) {
-            if (plane->known[i]) continue;
-            plane->known[i] = 1;
+            if (known[i]) continue;
+            known[i] = 1;
             x->where[n] = (unsigned)i;
             x->batch[3 * n] = disti_extract_coordinate(x, 0, (double)(i % x->side));
             x->batch[3 * n + 1] = disti_extract_coordinate(x, 1, (double)(i / x->side));
@@ -16302,8 +16303,9 @@ static int disti_extract_cell(disti_extract *x, const size_t cell[3])
 {
     int code = 0;
     size_t at = cell[1] * x->side + cell[0];
+    const float *value[2] = {x->plane[0].value, x->plane[1].value};
     for (int c = 0; c < 8; c++)
-        code |= (x->plane[c >> 2].value[at + (size_t)(c >> 1 & 1) * x->side + (size_t)(c & 1)] < x->level) << c;
+        code |= (value[c >> 2][at + (size_t)(c >> 1 & 1) * x->side + (size_t)(c & 1)] < x->level) << c;
     const disti_case *found = x->cases + code;
     for (int i = 0; i < found->triangles; i++) {
         unsigned v[3];

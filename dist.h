@@ -13114,30 +13114,35 @@ static void disti_silhouette(const disti_tracer *tracer, int worker, const disti
      first f > epsilon.
    Coarse-to-fine starts with a ray for each 4 x 4, then 2 x 2 pixels, three steps each; children go on at their
    parent's distance and inherit its samples, although those do not lie on the child's ray. 0.1 is 0.1 radii here. */
-typedef struct disti_paper_ray {
-    disti_ray ray;
-    float samples[8 * 4]; /* f and point of the K samples of smallest |f|, ascending */
-} disti_paper_ray;
+typedef struct disti_paper_level { /* its rays, in rows */
+    disti_ray *rays;
+    float *samples; /* f and point of the K samples of smallest |f| of each ray, ascending; NULL: not wanted */
+    size_t n, across, stride; /* stride: of the samples' rows, in rays */
+} disti_paper_level;
+
+static float *disti_paper_samples(const disti_tracer *tracer, const disti_paper_level *level, size_t i)
+{
+    size_t place = i / level->across * level->stride + i % level->across;
+    return level->samples ? level->samples + place * (size_t)tracer->how.samples * 4 : NULL;
+}
 
 static void disti_paper_keep(float *samples, int count, float f, const float *p)
 {
-    float magnitude = f < 0.0f ? -f : f;
     int at = count;
-    while (at > 0) {
-        float other = samples[4 * (at - 1)];
-        if ((other < 0.0f ? -other : other) <= magnitude) break;
-        if (at < count) memcpy(samples + 4 * at, samples + 4 * (at - 1), 4 * sizeof(float));
-        at--;
-    }
+    while (at > 0 && !(fabsf(samples[4 * (at - 1)]) <= fabsf(f))) at--;
     if (at == count) return;
+    memmove(samples + 4 * (at + 1), samples + 4 * at, (size_t)(count - 1 - at) * 4 * sizeof(float));
     samples[4 * at] = f;
     memcpy(samples + 4 * at + 1, p, 3 * sizeof(float));
 }
 
-static void disti_paper_clear(float *samples, int count)
+static void disti_paper_clear(const disti_tracer *tracer, const disti_paper_level *level)
 {
-    memset(samples, 0, (size_t)count * 4 * sizeof(float));
-    for (int k = 0; k < count; k++) samples[4 * k] = 3e38f;
+    for (size_t i = 0; i < level->n && level->samples; i++) {
+        float *samples = disti_paper_samples(tracer, level, i);
+        memset(samples, 0, (size_t)tracer->how.samples * 4 * sizeof(float));
+        for (int k = 0; k < tracer->how.samples; k++) samples[4 * k] = 3e38f;
+    }
 }
 
 static float disti_clamp(float f, float limit)
@@ -13145,74 +13150,80 @@ static float disti_clamp(float f, float limit)
     return f > limit ? limit : f < -limit ? -limit : f;
 }
 
-/* One query's worth of marching. ray->s: t; f: last f; a: first f of the finest level; fa: smallest |f| there; moved: 1
-   if one was not finite. */
-static void disti_paper_step(const disti_tracer *tracer, disti_ray *ray, float *samples, float alpha, float f,
-                             const float *p)
+/* A step of each ray that is not done or, unless `all` are to go on, past the exit or at the surface, as many as the
+   budget has room for. ray->s: t; f: last f; a: first f of the level; fa: smallest |f| there; moved: 1 if one was not
+   finite. */
+static size_t disti_paper_march(const disti_tracer *tracer, int worker, const disti_bench *bench,
+                                const disti_paper_level *level, int all)
 {
-    float magnitude = f < 0.0f ? -f : f;
-    disti_keep_least(ray, ray->s, f);
-    if (samples) disti_paper_keep(samples, tracer->how.samples, f, p);
-    if (ray->steps == 0) ray->a = f;
-    if (ray->steps == 0 || magnitude < ray->fa) ray->fa = magnitude;
-    ray->f = f;
-    if (disti_finite(f)) ray->s += alpha * disti_clamp(f, 0.1f * tracer->field->radius);
-    else ray->moved = 1; /* and stays: a coarse ray's children go on from there */
-    ray->steps++;
+    float alpha = disti_paper_alpha(&tracer->how), clamp = 0.1f * tracer->field->radius;
+    size_t count = 0;
+    for (size_t i = 0; i < level->n; i++) {
+        const disti_ray *ray = &level->rays[i];
+        if (ray->mode == DISTI_DONE) continue;
+        if (!all && !(ray->s < ray->leave && fabsf(ray->f) >= tracer->epsilon)) continue;
+        disti_ray_point(ray, ray->s, bench->points + 3 * count);
+        bench->index[count++] = (int)i;
+    }
+    count = disti_query(tracer, worker, bench, count);
+    for (size_t k = 0; k < count; k++) {
+        disti_ray *ray = &level->rays[bench->index[k]];
+        float f = bench->sdf[k], *samples = disti_paper_samples(tracer, level, (size_t)bench->index[k]);
+        disti_keep_least(ray, ray->s, f);
+        if (samples) disti_paper_keep(samples, tracer->how.samples, f, bench->points + 3 * k);
+        if (ray->steps == 0) ray->a = f;
+        if (ray->steps == 0 || fabsf(f) < ray->fa) ray->fa = fabsf(f);
+        ray->f = f;
+        if (disti_finite(f)) ray->s += alpha * disti_clamp(f, clamp);
+        else ray->moved = 1; /* and stays: a coarse ray's children go on from there */
+        ray->steps++;
+    }
+    return count;
 }
 
-/* `steps` unconditional steps of coarse rays. */
-static void disti_paper_coarse(const disti_tracer *tracer, int worker, const disti_bench *bench, disti_paper_ray *rays,
-                               size_t n, int steps)
+/* Rays go on where their parents, each of 2 x 2, are: same distance along the ray, the parent's samples. */
+static void disti_paper_inherit(const disti_tracer *tracer, const disti_paper_level *parents,
+                                const disti_paper_level *level)
 {
-    for (int step = 0; step < steps; step++) {
-        size_t count = 0;
-        for (size_t i = 0; i < n; i++) {
-            if (rays[i].ray.mode == DISTI_DONE) continue;
-            disti_ray_point(&rays[i].ray, rays[i].ray.s, bench->points + 3 * count);
-            bench->index[count++] = (int)i;
-        }
-        count = disti_query(tracer, worker, bench, count);
-        bench->stats->cone_queries += count;
-        for (size_t k = 0; k < count; k++) {
-            disti_paper_ray *r = &rays[bench->index[k]];
-            disti_paper_step(tracer, &r->ray, r->samples, tracer->how.step_scale, bench->sdf[k], bench->points + 3 * k);
-        }
+    for (size_t i = 0; i < level->n; i++) {
+        size_t above = i / level->across / 2 * parents->across + i % level->across / 2;
+        const disti_ray *parent = &parents->rays[above];
+        disti_ray *ray = &level->rays[i];
+        if (ray->mode == DISTI_DONE) continue;
+        ray->s = (float)(parent->base + (double)parent->s - ray->base);
+        ray->best = (float)(parent->base + (double)parent->best - ray->base);
+        ray->fbest = parent->fbest;
+        ray->steps = 0;
+        if (level->samples)
+            memcpy(disti_paper_samples(tracer, level, i), disti_paper_samples(tracer, parents, above),
+                   (size_t)tracer->how.samples * 4 * sizeof(float));
     }
 }
 
-/* Child goes on where the parent is: same distance along the ray, the parent's samples. */
-static void disti_paper_inherit(const disti_tracer *tracer, const disti_paper_ray *parent, disti_ray *ray,
-                                float *samples)
-{
-    ray->s = (float)(parent->ray.base + (double)parent->ray.s - ray->base);
-    ray->best = (float)(parent->ray.base + (double)parent->ray.best - ray->base);
-    ray->fbest = parent->ray.fbest;
-    ray->steps = 0;
-    if (samples) memcpy(samples, parent->samples, (size_t)tracer->how.samples * 4 * sizeof(float));
-}
-
-/* Coarse rays of one level: blocks of `scale` pixels, centers at s g + (s - 1) / 2; alive where a pixel under them
-   meets the sphere. A coarse ray that itself misses it starts at the sphere's tangent length. */
-static size_t disti_paper_level(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench, int scale,
-                                disti_paper_ray *rays)
+/* A level of coarse rays: of blocks of `scale` pixels, centers at s g + (s - 1) / 2; alive where a pixel under them
+   meets the sphere. A coarse ray that itself misses it starts at the sphere's tangent length. Three steps each. */
+static void disti_paper_coarse(const disti_tracer *tracer, int worker, const disti_tile *tile, const disti_bench *bench,
+                               int scale, const disti_paper_level *parents, disti_paper_level *level)
 {
     int across = (tile->width + scale - 1) / scale, down = (tile->height + scale - 1) / scale;
+    level->across = level->stride = (size_t)across;
+    level->n = (size_t)(across * down);
     for (int g = 0; g < across * down; g++) {
         int x0 = g % across * scale, y0 = g / across * scale, alive = 0;
         double direction[3], world[3];
-        disti_paper_ray *r = &rays[g];
+        disti_ray *ray = &level->rays[g];
         disti_view_direction(tile->view, tile->x + x0 + 0.5 * (scale - 1), tile->y + y0 + 0.5 * (scale - 1), direction);
         disti_rotate_back(tile->view->rotation, direction, world);
-        disti_ray_init(tracer->field, tile->view->center, world, 0.0, &r->ray);
-        disti_paper_clear(r->samples, tracer->how.samples);
+        disti_ray_init(tracer->field, tile->view->center, world, 0.0, ray);
         for (int y = y0; y < DISTI_MIN(y0 + scale, tile->height); y++)
             for (int x = x0; x < DISTI_MIN(x0 + scale, tile->width); x++)
                 alive |= bench->rays[y * tile->width + x].mode != DISTI_DONE;
-        if (alive && r->ray.mode == DISTI_DONE) r->ray.s = 0.0f; /* the closest approach */
-        r->ray.mode = alive ? DISTI_MARCH : DISTI_DONE;
+        if (alive && ray->mode == DISTI_DONE) ray->s = 0.0f; /* the closest approach */
+        ray->mode = alive ? DISTI_MARCH : DISTI_DONE;
     }
-    return (size_t)(across * down);
+    disti_paper_clear(tracer, level);
+    if (parents) disti_paper_inherit(tracer, parents, level);
+    for (int k = 0; k < 3; k++) bench->stats->cone_queries += disti_paper_march(tracer, worker, bench, level, 1);
 }
 
 static void disti_paper_finish(const disti_tracer *tracer, disti_ray *ray)
@@ -13250,51 +13261,27 @@ static void disti_paper_finish(const disti_tracer *tracer, disti_ray *ray)
 static void disti_paper_trace(const disti_tracer *tracer, int worker, const disti_tile *tile, const disti_bench *bench,
                               float *samples, size_t samples_stride)
 {
-    size_t n = (size_t)(tile->width * tile->height), kept = (size_t)tracer->how.samples * 4;
+    size_t n = (size_t)(tile->width * tile->height);
     int row = tracer->how.paper_row, steps = tracer->how.max_steps;
     if (bench->budget && bench->budget->per_hit > 0) /* what all rays would owe, but at most half of it */
         bench->budget->hits = DISTI_MIN((unsigned long long)n, bench->budget->left / 2 / bench->budget->per_hit);
-    int pyramid = row == DIST_PAPER_COARSE_TO_FINE;
-    float alpha = disti_paper_alpha(&tracer->how);
-    disti_paper_ray *quarter = (disti_paper_ray *)(void *)bench->rest, *half = quarter + 64;
-    int across4 = (tile->width + 3) / 4, across2 = (tile->width + 1) / 2;
-    if (pyramid) {
-        size_t count = disti_paper_level(tracer, tile, bench, 4, quarter);
-        disti_paper_coarse(tracer, worker, bench, quarter, count, 3);
-        count = disti_paper_level(tracer, tile, bench, 2, half);
-        for (size_t g = 0; g < count; g++)
-            disti_paper_inherit(tracer, &quarter[(int)g / across2 / 2 * across4 + (int)g % across2 / 2], &half[g].ray,
-                                half[g].samples);
-        disti_paper_coarse(tracer, worker, bench, half, count, 3);
+    disti_paper_level level = {bench->rays, samples, n, (size_t)tile->width, samples_stride};
+    disti_paper_clear(tracer, &level);
+    if (row == DIST_PAPER_COARSE_TO_FINE) {
+        enum { QUARTER = 64, HALF = 256 }; /* rays at most, of the tiles of this tracer */
+        disti_ray *rays = (disti_ray *)(void *)bench->rest;
+        float *kept = samples ? (float *)(void *)(rays + QUARTER + HALF) : NULL;
+        disti_paper_level quarter = {rays, kept, 0, 0, 0}, half = {rays + QUARTER, kept, 0, 0, 0};
+        if (kept) half.samples += QUARTER * 4 * tracer->how.samples;
+        disti_paper_coarse(tracer, worker, tile, bench, 4, NULL, &quarter);
+        disti_paper_coarse(tracer, worker, tile, bench, 2, &quarter, &half);
+        disti_paper_inherit(tracer, &half, &level);
         steps = DISTI_MAX(steps - 6, 1);
     }
-    for (size_t i = 0; i < n; i++) {
-        size_t x = i % (size_t)tile->width, y = i / (size_t)tile->width;
-        float *mine = samples ? samples + y * samples_stride * kept + x * kept : NULL;
-        disti_ray *ray = &bench->rays[i];
-        if (mine) disti_paper_clear(mine, tracer->how.samples);
-        if (ray->mode != DISTI_DONE && pyramid)
-            disti_paper_inherit(tracer, &half[y / 2 * (size_t)across2 + x / 2], ray, mine);
-    }
     for (int step = 0; step < steps; step++) {
-        size_t count = 0;
-        for (size_t i = 0; i < n; i++) {
-            disti_ray *ray = &bench->rays[i];
-            float magnitude = ray->f < 0.0f ? -ray->f : ray->f;
-            if (ray->mode == DISTI_DONE) continue;
-            if (row != DIST_PAPER_PARALLEL && step > 0 && !(ray->s < ray->leave && magnitude >= tracer->epsilon))
-                continue;
-            disti_ray_point(ray, ray->s, bench->points + 3 * count);
-            bench->index[count++] = (int)i;
-        }
-        count = disti_query(tracer, worker, bench, count);
+        size_t count = disti_paper_march(tracer, worker, bench, &level, step == 0 || row == DIST_PAPER_PARALLEL);
         if (count == 0) break;
         bench->stats->march_queries += count;
-        for (size_t k = 0; k < count; k++) {
-            size_t i = (size_t)bench->index[k], x = i % (size_t)tile->width, y = i / (size_t)tile->width;
-            float *mine = samples ? samples + y * samples_stride * kept + x * kept : NULL;
-            disti_paper_step(tracer, &bench->rays[i], mine, alpha, bench->sdf[k], bench->points + 3 * k);
-        }
     }
     for (size_t i = 0; i < n; i++)
         if (bench->rays[i].mode != DISTI_DONE) disti_paper_finish(tracer, &bench->rays[i]);

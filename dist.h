@@ -10358,17 +10358,19 @@ static int disti_ray_marched(const disti_tracer *tracer, disti_ray *ray, float f
     return disti_ray_onward(tracer, ray);
 }
 
+static void disti_keep_least(disti_ray *ray, float s, float f)
+{
+    if (!disti_finite(f) || fabsf(f) >= fabsf(ray->fbest)) return;
+    ray->best = s;
+    ray->fbest = f;
+}
+
 /* One sample f at ray->q: what follows from it. 1: another query at ray->q; 0: done, ray->status says how. */
 static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float sample)
 {
     float f = sample * ray->sign, q = ray->q;
     if (!disti_finite(sample)) return disti_ray_end(ray, DIST_RAY_NOT_FINITE, q, 0.0f, 0.0f);
-    float magnitude = sample < 0.0f ? -sample : sample;
-    float least = ray->fbest < 0.0f ? -ray->fbest : ray->fbest;
-    if (magnitude < least) {
-        ray->best = q;
-        ray->fbest = sample;
-    }
+    disti_keep_least(ray, q, sample);
     ray->steps++;
     if (tracer->how.any_hit && f < 0.0f && ray->mode != DISTI_FIRST)
         return disti_ray_end(ray, DIST_RAY_HIT, q, f, q - ray->s);
@@ -12559,14 +12561,6 @@ static int disti_wants_minimum(const disti_ray *ray)
 static int disti_has_minimum(const disti_ray *ray)
 {
     return ray->status == DIST_RAY_MISS && ray->enter < ray->leave && ray->fbest < 2e38f;
-}
-
-static void disti_keep_least(disti_ray *ray, float s, float f)
-{
-    float a = f < 0.0f ? -f : f, b = ray->fbest < 0.0f ? -ray->fbest : ray->fbest;
-    if (!disti_finite(f) || a >= b) return;
-    ray->best = s;
-    ray->fbest = f;
 }
 
 /* What is known of a tile's rays while their least |f| is looked for. */

@@ -9532,6 +9532,7 @@ DIST_API dist_render_desc dist_render_desc_resolve(const dist_render_desc *desc)
 
 static dist_status disti_how_check(dist_context *ctx, const dist_render_desc *how, const char *function)
 {
+    if (!how) return DIST_OK;
     const double any = 3e38;
     const disti_limit limits[] = {
         {"how.max_steps", (double)how->max_steps, 0, 60000}, {"how.samples", (double)how->samples, 0, 8},
@@ -9588,20 +9589,17 @@ static float disti_field_noise(const dist_field *field)
 static dist_status disti_tracer_init(disti_tracer *tracer, dist_context *ctx, const dist_field *field,
                                      const dist_render_desc *desc, const char *function)
 {
-    dist_render_desc raw;
-    memset(&raw, 0, sizeof raw);
-    if (desc) raw = *desc;
-    dist_status status = disti_how_check(ctx, &raw, function);
+    dist_status status = disti_how_check(ctx, desc, function);
     if (status != DIST_OK) return status;
     tracer->ctx = ctx;
     tracer->field = field;
     tracer->how = dist_render_desc_resolve(desc);
     tracer->detail = field->detail > 0.0f ? field->detail : field->radius;
     if (tracer->how.normal_delta == 0.0f) tracer->how.normal_delta = 1e-3f * tracer->detail;
-    else if (!(raw.normal_delta >= 1e-6f * field->radius && raw.normal_delta <= field->radius))
+    else if (!(tracer->how.normal_delta >= 1e-6f * field->radius && tracer->how.normal_delta <= field->radius))
         return disti_fail(ctx, DIST_BAD_ARGUMENT,
                           "%s: how.normal_delta is %d, must be 1e-6 to 1 of the field's radius, %d", function,
-                          (double)raw.normal_delta, (double)field->radius);
+                          (double)tracer->how.normal_delta, (double)field->radius);
     tracer->lipschitz = tracer->how.lipschitz > 0.0f ? tracer->how.lipschitz
                         : field->lipschitz > 0.0f    ? field->lipschitz
                                                      : 1.0f;
@@ -13411,12 +13409,8 @@ static dist_status disti_tape_take(dist_context *ctx, dist_tape *tape, const dis
 
 static dist_status disti_tape_check(dist_context *ctx, const dist_camera *camera, const dist_render_desc *desc)
 {
-    const char *name = "dist_tape_create";
-    dist_render_desc raw;
-    memset(&raw, 0, sizeof raw);
-    if (desc) raw = *desc;
-    dist_status status = disti_camera_check(ctx, camera, name);
-    return status == DIST_OK ? disti_how_check(ctx, &raw, name) : status;
+    dist_status status = disti_camera_check(ctx, camera, "dist_tape_create");
+    return status == DIST_OK ? disti_how_check(ctx, desc, "dist_tape_create") : status;
 }
 
 DIST_API dist_tape *dist_tape_create(dist_context *ctx, const dist_camera *camera, const dist_render_desc *desc)

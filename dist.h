@@ -9457,6 +9457,10 @@ DIST_API void dist_camera_ray(const dist_camera *camera, float x, float y, float
 
 /*@ 07 trace -------------------------------------------------------------------------------------------------------- */
 
+typedef struct disti_sample { /* of f, at s along a ray */
+    float s, f;
+} disti_sample;
+
 /* A ray in the field's space, p(s) = origin + s direction, with origin the point closest to the bounding sphere's
    center, so that s stays within the radius however far the camera is; distance along the ray = base + s. */
 typedef struct disti_ray {
@@ -9467,14 +9471,14 @@ typedef struct disti_ray {
     float cosine;       /* of the angle to the camera's axis: depth = distance * cosine */
     float start, guard; /* where the cones left it, and at most f there (3e38 without cones) */
     float q;            /* where f is wanted next */
-    float s, f;         /* front: nothing lies before it */
+    disti_sample front; /* nothing lies before it */
     float slope;        /* df/ds of the last two samples */
-    float a, fa, b, fb; /* bracket: fa > 0 >= fb, a < b; while marching b, fb: a sample beyond a gap, fb = 0: none */
+    disti_sample a, b;  /* bracket: a.f > 0 >= b.f, a.s < b.s; while marching b: beyond a gap, b.f = 0: none */
     float width;        /* bracket's width at first; before: longest first step to trust, in epsilons */
     float best, fbest;  /* sample of smallest |f| */
     float error;
-    float crept, fcrept; /* front where samples near the surface began to stand too far apart to prove what is between
-                            them; fcrept = 0: they do not. Certified: last sample of 32 noises or more */
+    disti_sample crept; /* front where samples near the surface began to stand too far apart to prove what is between
+                           them; f = 0: they do not. Certified: last sample of 32 noises or more */
     float sign;         /* -1: looking for the way out of the solid */
     unsigned short steps;
     unsigned char mode, status;
@@ -9492,7 +9496,7 @@ typedef struct disti_ray {
 enum {
     DISTI_DONE,
     DISTI_WAIT,    /* its turn has not come */
-    DISTI_FIRST,   /* the start of the march; b, fb > 0: a second query, before b */
+    DISTI_FIRST,   /* the start of the march; b.f > 0: a second query, before b */
     DISTI_MARCH,   /* a sphere step */
     DISTI_SKIP,    /* past what other rays' samples prove empty */
     DISTI_JUMP,    /* to where f should end */
@@ -9653,7 +9657,7 @@ DISTI_INLINE void disti_ray_place(const dist_field *field, double cx, double cy,
     float enter = (float)(-half > -along ? -half : -along), leave = (float)half; /* nothing behind the camera */
     int meets = half > 0.0 && enter < leave;
     ray->leave = meets ? leave : enter;
-    ray->enter = ray->s = ray->best = ray->start = ray->q = enter;
+    ray->enter = ray->front.s = ray->best = ray->start = ray->q = enter;
     ray->status = DIST_RAY_MISS;
     ray->guard = 3e38f;
     ray->mode = (unsigned char)(meets ? DISTI_FIRST : DISTI_DONE);
@@ -9706,16 +9710,21 @@ static int disti_ray_end(disti_ray *ray, int status, float s, float f, float err
     return 0;
 }
 
+static int disti_ray_miss(disti_ray *ray)
+{
+    return disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest * ray->sign, 0.0f);
+}
+
 /* Ends a ray whose budget is spent: its best sample, or without one where it would look next. What lies before the
    front is known to be empty; a bracket says more. */
 static int disti_ray_give_up(disti_ray *ray)
 {
     int mode = ray->mode, begun = mode >= DISTI_MARCH && mode <= DISTI_BRACKET && mode != DISTI_BACK;
-    float front = mode == DISTI_BRACKET || mode == DISTI_LEAST ? ray->a
+    float front = mode == DISTI_BRACKET || mode == DISTI_LEAST ? ray->a.s
                   : mode == DISTI_BACK                         ? ray->enter
-                  : begun                                      ? ray->s
+                  : begun                                      ? ray->front.s
                                                                : ray->start;
-    float end = mode == DISTI_BRACKET || (begun && ray->fb < 0.0f && ray->b > ray->s) ? ray->b : ray->leave;
+    float end = mode == DISTI_BRACKET || (begun && ray->b.f < 0.0f && ray->b.s > ray->front.s) ? ray->b.s : ray->leave;
     float s = ray->fbest < 2e38f ? ray->best : ray->q;
     return disti_ray_end(ray, DIST_RAY_UNRESOLVED, s, ray->fbest * ray->sign, DISTI_MAX(s - front, end - s));
 }
@@ -9738,34 +9747,34 @@ static float disti_ray_kink(const disti_tracer *tracer, const disti_ray *ray, fl
 {
     float most = 0.04f * tracer->field->radius, flat = tracer->noise;
     if (falls < 0.15f * tracer->lipschitz && ray->incline < -2.0f * falls)
-        flat = 12.0f * disti_ray_epsilon(tracer, ray, ray->a);
+        flat = 12.0f * disti_ray_epsilon(tracer, ray, ray->a.s);
     flat = DISTI_MAX(flat < most * falls ? flat / falls : most, ray->target);
-    float way = ray->b - ray->crept;
-    int certified = tracer->how.certified, crept = ray->fcrept > 0.0f;
-    if (!certified && crept && falls * way > 2.0f * ray->fcrept) flat = DISTI_MAX(flat, DISTI_MIN(way, 0.5f * most));
-    if (ray->fa - ray->fb < 2.0f * tracer->noise) {
+    float way = ray->b.s - ray->crept.s;
+    int certified = tracer->how.certified, crept = ray->crept.f > 0.0f;
+    if (!certified && crept && falls * way > 2.0f * ray->crept.f) flat = DISTI_MAX(flat, DISTI_MIN(way, 0.5f * most));
+    if (ray->a.f - ray->b.f < 2.0f * tracer->noise) {
         float slope = tracer->lipschitz / 16.0f;
         if (certified && crept && way > 0.0f)
-            slope = DISTI_MIN(slope, 0.5f * (ray->fcrept - 2.0f * tracer->noise) / way);
+            slope = DISTI_MIN(slope, 0.5f * (ray->crept.f - 2.0f * tracer->noise) / way);
         flat = DISTI_MAX(flat, tracer->noise / slope);
     }
     return ray->incline > -0.12f * tracer->lipschitz ? DISTI_MAX(flat, DISTI_MIN(ray->width, most)) : flat;
 }
 
-/* Bracket [a, b], fa > 0 >= fb, finished by ITP (Oliveira and Takahashi 2020): regula falsi, pushed a little toward the
-   middle and kept so near it that few more queries are needed than a bisection's. So slope, clamp and kinks cannot make
-   it oscillate or crawl, and equal ends cannot divide by 0. */
+/* Bracket [a, b], a.f > 0 >= b.f, finished by ITP (Oliveira and Takahashi 2020): regula falsi, pushed a little toward
+   the middle and kept so near it that few more queries are needed than a bisection's. So slope, clamp and kinks cannot
+   make it oscillate or crawl, and equal ends cannot divide by 0. */
 static int disti_ray_bracket(const disti_tracer *tracer, disti_ray *ray)
 {
-    float width = ray->b - ray->a, middle = 0.5f * (ray->a + ray->b);
-    float epsilon = DISTI_MAX(disti_ray_epsilon(tracer, ray, ray->a), 2.4e-7f * tracer->field->radius);
-    float q = ray->fa > ray->fb ? ray->a + width * (ray->fa / (ray->fa - ray->fb)) : middle; /* both may be 0 */
+    float width = ray->b.s - ray->a.s, middle = 0.5f * (ray->a.s + ray->b.s);
+    float epsilon = DISTI_MAX(disti_ray_epsilon(tracer, ray, ray->a.s), 2.4e-7f * tracer->field->radius);
+    float q = ray->a.f > ray->b.f ? ray->a.s + width * (ray->a.f / (ray->a.f - ray->b.f)) : middle; /* both may be 0 */
     if (width <= epsilon) {
-        float falls = (ray->fa - ray->fb) / width, before = -ray->slope, error = width;
+        float falls = (ray->a.f - ray->b.f) / width, before = -ray->slope, error = width;
         if (disti_coarse(tracer, epsilon) && ray->side == 0 && before > 0.0f && falls > 0.0f) {
             /* as below: no farther than |f| takes from an end at a third of the slopes, where two in a row are alike */
             float flatter = DISTI_MIN(falls, before), uneven = DISTI_MAX(falls, before) / flatter;
-            float off = 3.0f * DISTI_MIN(ray->fa, -ray->fb) * uneven * uneven + tracer->noise;
+            float off = 3.0f * DISTI_MIN(ray->a.f, -ray->b.f) * uneven * uneven + tracer->noise;
             if (off < width * flatter) error = DISTI_MAX(off / flatter, 0.5f * width);
         }
         ray->slope = -falls;
@@ -9780,93 +9789,85 @@ static int disti_ray_bracket(const disti_tracer *tracer, disti_ray *ray)
     q = (middle - q) * toward > push ? q + toward * push : middle;
     if ((middle - q) * toward > room) q = middle - toward * room;
     float least = DISTI_MIN(0.125f * epsilon, 0.25f * width); /* never at an end */
-    q = DISTI_MIN(DISTI_MAX(q, ray->a + least), ray->b - least);
+    q = DISTI_MIN(DISTI_MAX(q, ray->a.s + least), ray->b.s - least);
     ray->side++;
     return disti_ray_ask(ray, DISTI_BRACKET, q);
 }
 
 /* A sample inside the bracket. The error is judged in s: |f| over the slopes to the bracket's ends. */
-static int disti_ray_bracketed(const disti_tracer *tracer, disti_ray *ray, float f)
+static int disti_ray_bracketed(const disti_tracer *tracer, disti_ray *ray, disti_sample now)
 {
-    float tolerance = 0.25f * disti_ray_epsilon(tracer, ray, ray->q);
-    float slope_a = (ray->fa - f) / (ray->q - ray->a), slope_b = (f - ray->fb) / (ray->b - ray->q);
-    int inside = f <= 0.0f, apart = ray->q > ray->a && ray->q < ray->b; /* of an end at q there is no slope */
+    float tolerance = 0.25f * disti_ray_epsilon(tracer, ray, now.s);
+    float slope_a = (ray->a.f - now.f) / (now.s - ray->a.s), slope_b = (now.f - ray->b.f) / (ray->b.s - now.s);
+    int inside = now.f <= 0.0f, apart = now.s > ray->a.s && now.s < ray->b.s; /* of an end at it there is no slope */
     float slope = inside ? slope_a : slope_b;
     float other = inside ? slope_b : slope_a;
-    float magnitude = f < 0.0f ? -f : f;
+    float magnitude = fabsf(now.f);
     float aside = other > 0.0f ? other : -other, flatter = DISTI_MIN(slope, aside);
     if (apart && slope > 1e-3f && magnitude <= tolerance * DISTI_MIN(0.5f * slope, flatter)) {
         ray->slope = -slope;
-        float width = ray->b - ray->a, error = width;
+        float width = ray->b.s - ray->a.s, error = width;
         if (flatter > 0.0f && disti_finite(slope + aside)) {
             float off = magnitude * (DISTI_MAX(slope, aside) / flatter) + tracer->noise;
             if (disti_coarse(tracer, 4.0f * tolerance)) off += off;
             if (off < width * flatter) error = off / flatter;
         }
         error = DISTI_MAX(error, disti_ray_kink(tracer, ray, flatter));
-        return disti_ray_end(ray, DIST_RAY_HIT, ray->q + f / slope, 0.0f, error);
+        return disti_ray_end(ray, DIST_RAY_HIT, now.s + now.f / slope, 0.0f, error);
     }
-    if (inside) {
-        ray->b = ray->q;
-        ray->fb = f;
-    } else {
-        ray->a = ray->q;
-        ray->fa = f;
-    }
+    if (inside) ray->b = now;
+    else ray->a = now;
     return disti_ray_bracket(tracer, ray);
 }
 
-/* How much of the bracket [a, b], fa > 0 >= fb, is beyond the empty spheres at its ends: room for other surfaces than
+/* How much of the bracket [a, b], a.f > 0 >= b.f, is beyond the empty spheres at its ends: room for other surfaces than
    the one that f crosses. */
-static float disti_ray_room(const disti_tracer *tracer, float a, float fa, float b, float fb)
+static float disti_ray_room(const disti_tracer *tracer, disti_sample a, disti_sample b)
 {
-    return b - a - disti_empty(tracer, fa) - disti_empty(tracer, -fb);
+    return b.s - a.s - disti_empty(tracer, a.f) - disti_empty(tracer, -b.f);
 }
 
 /* Whether that is no more than `most` of the radius; certified: than epsilon, and so near the hit is the first one. */
-static int disti_ray_alone(const disti_tracer *tracer, const disti_ray *ray, float a, float fa, float b, float fb,
-                           float most)
+static int disti_ray_alone(const disti_tracer *tracer, const disti_ray *ray, disti_sample a, disti_sample b, float most)
 {
-    float room = tracer->how.certified ? disti_ray_epsilon(tracer, ray, ray->s) : most * tracer->detail;
-    return disti_ray_room(tracer, a, fa, b, fb) <= room;
+    float room = tracer->how.certified ? disti_ray_epsilon(tracer, ray, ray->front.s) : most * tracer->detail;
+    return disti_ray_room(tracer, a, b) <= room;
 }
 
 /* How far before the end of a bracket [a, b] f may have crossed 0: the slope before it foretells a crossing at
-   a + fa / -slope, and where f falls by less than 0.6 of that slope (chosen, not derived) it has bent on the way, above
-   0 or below. Certified steps allow no crossing before a, and in the bracket none but in its room. */
-static float disti_ray_bent(const disti_tracer *tracer, const disti_ray *ray, float a, float fa, float b, float fb)
+   a.s + a.f / -slope, and where f falls by less than 0.6 of that slope (chosen, not derived) it has bent on the way,
+   above 0 or below. Certified steps allow no crossing before a, and in the bracket none but in its room. */
+static float disti_ray_bent(const disti_tracer *tracer, const disti_ray *ray, disti_sample a, disti_sample b)
 {
     if (tracer->how.certified) {
-        float room = disti_ray_room(tracer, a, fa, b, fb);
+        float room = disti_ray_room(tracer, a, b);
         return room > 4.8e-7f * tracer->field->radius ? room : 0.0f;
     }
-    if (!ray->known || -0.6f * ray->slope * (b - a) <= fa - fb) return 0.0f;
-    return b - a + fa / ray->slope;
+    if (!ray->known || -0.6f * ray->slope * (b.s - a.s) <= a.f - b.f) return 0.0f;
+    return b.s - a.s + a.f / ray->slope;
 }
 
 /* Into the bracket [a, b], or from the nearest sample in it on, if the march had one and took it back. */
-static int disti_ray_open_bracket(const disti_tracer *tracer, disti_ray *ray, float a, float fa, float b, float fb)
+static int disti_ray_open_bracket(const disti_tracer *tracer, disti_ray *ray, disti_sample a, disti_sample b)
 {
-    float best = ray->fbest * ray->sign;
+    disti_sample best = {ray->best, ray->fbest * ray->sign};
     int marching = ray->mode == DISTI_MARCH || ray->mode == DISTI_SKIP || ray->mode == DISTI_JUMP;
-    ray->target = disti_ray_bent(tracer, ray, a, fa, b, fb);
-    if (marching && ray->best > a && ray->best < b && best > 0.0f && best < fa) {
-        a = ray->best;
-        fa = best;
-        ray->target = DISTI_MAX(ray->target, disti_ray_bent(tracer, ray, a, fa, b, fb));
+    ray->target = disti_ray_bent(tracer, ray, a, b);
+    if (marching && best.s > a.s && best.s < b.s && best.f > 0.0f && best.f < a.f) {
+        a = best;
+        ray->target = DISTI_MAX(ray->target, disti_ray_bent(tracer, ray, a, b));
     }
     ray->a = a;
-    ray->fa = fa;
     ray->b = b;
-    ray->fb = fb;
-    ray->width = b - a;
-    ray->incline = (fb - fa) / (b - a);
+    ray->width = b.s - a.s;
+    ray->incline = (b.f - a.f) / ray->width;
     ray->side = 0;
-    float epsilon = disti_ray_epsilon(tracer, ray, a);
-    if (tracer->how.certified && b > a && b - a <= 2.0f * epsilon && fa > fb && !disti_coarse(tracer, epsilon)) {
+    float epsilon = disti_ray_epsilon(tracer, ray, a.s);
+    int small = ray->width > 0.0f && ray->width <= 2.0f * epsilon;
+    if (tracer->how.certified && small && a.f > b.f && !disti_coarse(tracer, epsilon)) {
         ray->slope = ray->incline;
-        float error = DISTI_MAX(b - a, disti_ray_kink(tracer, ray, -ray->incline));
-        return disti_ray_end(ray, DIST_RAY_HIT, a + (b - a) * (fa / (fa - fb)), 0.0f, error);
+        float error = DISTI_MAX(ray->width, disti_ray_kink(tracer, ray, -ray->incline));
+        return disti_ray_end(ray, DIST_RAY_HIT, a.s + ray->width * (a.f / (a.f - b.f)), 0.0f, error);
     }
     return disti_ray_bracket(tracer, ray);
 }
@@ -9878,7 +9879,7 @@ static float disti_ray_floor(const disti_tracer *tracer, const disti_ray *ray)
 {
     if (tracer->how.certified) return 0.0f;
     float patience = ray->steps > 20 ? 1.0f + 0.1f * (float)(ray->steps - 20) : 1.0f;
-    float pixel = 2.0f * (float)(ray->base + (double)ray->s) * ray->footprint, radius = tracer->detail;
+    float pixel = 2.0f * (float)(ray->base + (double)ray->front.s) * ray->footprint, radius = tracer->detail;
     return patience * DISTI_MAX(5e-4f * radius, DISTI_MIN(pixel, 3e-3f * radius));
 }
 
@@ -9886,22 +9887,18 @@ static float disti_ray_floor(const disti_tracer *tracer, const disti_ray *ray)
    may cross 0 there (to 10 of the default epsilon: chosen by what decoders do, not derived), or past spheres to where f
    is all but 0; until f is larger again. A certified ray takes no such step; it notes the last sample well above noise,
    from which the mean slope to a hit is known. */
-static void disti_ray_creeps(const disti_tracer *tracer, disti_ray *ray, float f, int trusted)
+static void disti_ray_creeps(const disti_tracer *tracer, disti_ray *ray, disti_sample now, int trusted)
 {
     float ripple = 10.0f * disti_default_epsilon(tracer);
     if (tracer->how.certified) {
-        if (!(f >= 32.0f * tracer->noise)) return;
-        ray->crept = ray->q;
-        ray->fcrept = f;
+        if (now.f >= 32.0f * tracer->noise) ray->crept = now;
         return;
     }
-    int skips = ray->mode == DISTI_SKIP && f < disti_ray_near(tracer, ray, ray->q);
-    if (skips || (trusted && f < ripple && ray->slope > -0.3f * tracer->lipschitz)) {
-        if (ray->fcrept > 0.0f) return;
-        ray->crept = ray->s;
-        ray->fcrept = ray->f;
-    } else if (f >= ripple) {
-        ray->fcrept = 0.0f;
+    int skips = ray->mode == DISTI_SKIP && now.f < disti_ray_near(tracer, ray, now.s);
+    if (skips || (trusted && now.f < ripple && ray->slope > -0.3f * tracer->lipschitz)) {
+        if (!(ray->crept.f > 0.0f)) ray->crept = ray->front;
+    } else if (now.f >= ripple) {
+        ray->crept.f = 0.0f;
     }
 }
 
@@ -9910,14 +9907,14 @@ static void disti_ray_creeps(const disti_tracer *tracer, disti_ray *ray, float f
    certified ray takes it as soon as the spheres at its two ends leave no more than epsilon between them. */
 static float disti_ray_jump(const disti_tracer *tracer, const disti_ray *ray, float falls, float radius)
 {
-    int solid = ray->fb < 0.0f, certified = tracer->how.certified;
-    float epsilon = certified ? disti_ray_epsilon(tracer, ray, ray->s) : disti_ray_near(tracer, ray, ray->s);
-    float jump = ray->f / falls, beyond = 1.03f * jump + 0.5f * epsilon;
-    if (certified) return jump - radius <= 0.4f * epsilon && !(solid && ray->s + beyond >= ray->b) ? beyond : 0.0f;
+    int solid = ray->b.f < 0.0f, certified = tracer->how.certified;
+    float s = ray->front.s, epsilon = certified ? disti_ray_epsilon(tracer, ray, s) : disti_ray_near(tracer, ray, s);
+    float jump = ray->front.f / falls, beyond = 1.03f * jump + 0.5f * epsilon;
+    if (certified) return jump - radius <= 0.4f * epsilon && !(solid && s + beyond >= ray->b.s) ? beyond : 0.0f;
     float cap = 3.0f * radius + epsilon;
     if (solid || beyond <= cap) return solid ? 0.0f : beyond;
     /* short of the end: f must still be positive there, or something came in between */
-    if (DISTI_MAX(ray->f, radius) < 5e-3f * tracer->detail)
+    if (DISTI_MAX(ray->front.f, radius) < 5e-3f * tracer->detail)
         cap = DISTI_MAX(cap, 1e-2f * tracer->detail);
     return DISTI_MIN(0.97f * jump, cap);
 }
@@ -9928,31 +9925,30 @@ static float disti_ray_jump(const disti_tracer *tracer, const disti_ray *ray, fl
    may begin with the slope that its neighbors' hits foretell. */
 static int disti_ray_step(const disti_tracer *tracer, disti_ray *ray)
 {
-    float radius = disti_empty(tracer, ray->f);
+    float radius = disti_empty(tracer, ray->front.f);
     int certified = tracer->how.certified, told = certified && !ray->known && ray->incline < 0.0f;
     float slope = (told ? ray->incline : ray->slope) / tracer->lipschitz;
-    if (ray->fb < 0.0f && ray->s + radius >= ray->b) /* not Lipschitz after all */
-        return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->b, ray->fb);
-    if (ray->s + radius >= ray->leave)
-        return disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest * ray->sign, 0.0f);
+    if (ray->b.f < 0.0f && ray->front.s + radius >= ray->b.s) /* not Lipschitz after all */
+        return disti_ray_open_bracket(tracer, ray, ray->front, ray->b);
+    if (ray->front.s + radius >= ray->leave) return disti_ray_miss(ray);
     float relaxed = (certified ? 1.95f : 1.8f) / (1.0f - DISTI_MIN(slope, 0.75f));
     float stretch = ray->known || told ? DISTI_MAX(1.0f, relaxed) : tracer->how.step_scale;
     float step = radius * DISTI_MIN(stretch, 8.0f), jump = 0.0f;
-    int local = ray->fa > 0.0f; /* the slope; one over what was skipped says nothing of what comes next */
+    int local = ray->a.f > 0.0f; /* the slope; one over what was skipped says nothing of what comes next */
     int tells = told || (ray->known && (local || certified));
-    if (tells && slope < -0.05f && DISTI_MAX(ray->f, radius) < 0.05f * tracer->detail)
+    if (tells && slope < -0.05f && DISTI_MAX(ray->front.f, radius) < 0.05f * tracer->detail)
         jump = disti_ray_jump(tracer, ray, told ? -ray->incline : -ray->slope, radius);
     int mode = jump > 0.0f ? DISTI_JUMP : DISTI_MARCH;
     if (jump > 0.0f) step = jump;
     if (ray->known && local && slope > -0.3f) { /* but not through a surface that the slope foretells */
         float floor = disti_ray_floor(tracer, ray);
-        if (slope < 0.0f) floor = DISTI_MIN(floor, 0.9f * ray->f / -ray->slope);
+        if (slope < 0.0f) floor = DISTI_MIN(floor, 0.9f * ray->front.f / -ray->slope);
         step = DISTI_MAX(step, floor);
     }
-    float q = ray->s + step;
-    float spacing = ray->s + 2.4e-7f * tracer->field->radius;
-    if (ray->fb > 0.0f && ray->b > ray->s && q > ray->b) { /* into the gap before the sample beyond, not past it */
-        q = 0.5f * (ray->s + radius + ray->b - disti_empty(tracer, ray->fb));
+    float q = ray->front.s + step;
+    float spacing = ray->front.s + 2.4e-7f * tracer->field->radius;
+    if (ray->b.f > 0.0f && ray->b.s > ray->front.s && q > ray->b.s) { /* into the gap before that, not past it */
+        q = 0.5f * (ray->front.s + radius + ray->b.s - disti_empty(tracer, ray->b.f));
         mode = DISTI_MARCH;
     }
     q = DISTI_MAX(q, spacing);
@@ -9964,23 +9960,24 @@ static int disti_ray_step(const disti_tracer *tracer, disti_ray *ray)
    that bends away, not almost 0 instead: that may be the far side of what it went through. */
 static int disti_ray_trusts(const disti_tracer *tracer, const disti_ray *ray, float f, float step)
 {
-    float expected = ray->f + ray->slope * step;
+    float expected = ray->front.f + ray->slope * step;
     if (!ray->known || tracer->how.certified) return 0;
     int creeps = ray->slope > -0.3f * tracer->lipschitz && step <= 1.001f * disti_ray_floor(tracer, ray);
     if (creeps && expected > 0.0f) return 1;
     float off = f - expected;
-    if (f < 0.25f * expected && -off > 0.1f * ray->f) return 0;
-    return ray->mode == DISTI_JUMP && expected > 0.0f && off > -0.3f * ray->f && off < 0.5f * ray->f;
+    if (f < 0.25f * expected && -off > 0.1f * ray->front.f) return 0;
+    return ray->mode == DISTI_JUMP && expected > 0.0f && off > -0.3f * ray->front.f && off < 0.5f * ray->front.f;
 }
 
 /* A step down from a to s that was trusted though spheres do not cover it, no mere chord, and now f rises from s: does
    it do so from a crossing between the two? */
 static int disti_ray_doubts(const disti_tracer *tracer, const disti_ray *ray, float f, float step)
 {
-    float last = ray->s - ray->a, before = disti_empty(tracer, ray->fa), rise = f - ray->f;
-    if (tracer->how.certified || !(ray->fa > ray->f) || ray->fb < 0.0f || !(rise > 0.0f) || last <= 0.0f) return 0;
-    if (last <= before + disti_empty(tracer, ray->f) || last <= 2.0f * disti_ray_floor(tracer, ray)) return 0;
-    return ray->f * step < rise * (last - before);
+    float last = ray->front.s - ray->a.s, before = disti_empty(tracer, ray->a.f), rise = f - ray->front.f;
+    if (tracer->how.certified || !(ray->a.f > ray->front.f) || ray->b.f < 0.0f) return 0;
+    if (!(rise > 0.0f) || last <= 0.0f) return 0;
+    if (last <= before + disti_empty(tracer, ray->front.f) || last <= 2.0f * disti_ray_floor(tracer, ray)) return 0;
+    return ray->front.f * step < rise * (last - before);
 }
 
 /* Feels ahead in the band 0 < f < epsilon, farther each time; certified only as far as is proven empty. */
@@ -9988,9 +9985,9 @@ static int disti_ray_feel(const disti_tracer *tracer, disti_ray *ray, float epsi
 {
     float reach = DISTI_MIN(2.0f * epsilon, 0.01f * tracer->detail);
     for (int i = 0; i < ray->side && reach < 0.01f * tracer->detail; i++) reach *= 1.5f;
-    if (ray->slope < -1e-3f) reach = DISTI_MIN(1.2f * ray->f / -ray->slope, DISTI_MAX(reach, 64.0f * epsilon));
-    float q = ray->s + (tracer->how.certified ? disti_empty(tracer, ray->f) : DISTI_MAX(reach, 0.5f * epsilon));
-    q = DISTI_MAX(q, ray->s + 4.8e-7f * tracer->field->radius);
+    if (ray->slope < -1e-3f) reach = DISTI_MIN(1.2f * ray->front.f / -ray->slope, DISTI_MAX(reach, 64.0f * epsilon));
+    reach = tracer->how.certified ? disti_empty(tracer, ray->front.f) : DISTI_MAX(reach, 0.5f * epsilon);
+    float q = DISTI_MAX(ray->front.s + reach, ray->front.s + 4.8e-7f * tracer->field->radius);
     return disti_ray_ask(ray, DISTI_BAND, DISTI_MIN(q, ray->leave));
 }
 
@@ -10002,72 +9999,58 @@ static int disti_ray_feel(const disti_tracer *tracer, disti_ray *ray, float epsi
    has many: the ray goes on. */
 static int disti_ray_least(const disti_tracer *tracer, disti_ray *ray)
 {
-    float before = ray->s - ray->a, after = ray->b - ray->s;
-    float left = (ray->fa - ray->f) / before, right = (ray->fb - ray->f) / after;
+    float before = ray->front.s - ray->a.s, after = ray->b.s - ray->front.s;
+    float left = (ray->a.f - ray->front.f) / before, right = (ray->b.f - ray->front.f) / after;
     float drop = DISTI_MAX(right * before, left * after);
-    int spent = ray->moved > 12 || ray->b - ray->a < 4e-6f * tracer->field->radius;
-    float epsilon = disti_ray_near(tracer, ray, ray->s);
-    int flat = DISTI_MAX(ray->fa, ray->fb) - ray->f < tracer->noise;
+    int spent = ray->moved > 12 || ray->b.s - ray->a.s < 4e-6f * tracer->field->radius;
+    float epsilon = disti_ray_near(tracer, ray, ray->front.s);
+    int flat = DISTI_MAX(ray->a.f, ray->b.f) - ray->front.f < tracer->noise;
     float gentler = DISTI_MIN(left, right);
     float thin = DISTI_MIN(epsilon, DISTI_MAX(disti_default_epsilon(tracer), tracer->noise));
-    int narrow = gentler > 0.3f * tracer->lipschitz || (gentler > 0.0f && !flat && ray->b - ray->a < thin);
-    int sheet = narrow && ray->f < 0.5f * thin; /* too thin to be sure of */
-    if (spent || drop < ray->f) {
+    int narrow = gentler > 0.3f * tracer->lipschitz || (gentler > 0.0f && !flat && ray->b.s - ray->a.s < thin);
+    int sheet = narrow && ray->front.f < 0.5f * thin; /* too thin to be sure of */
+    if (spent || drop < ray->front.f) {
         ray->slope = -left;
-        if (sheet || (!flat && ray->f <= tracer->noise))
-            return disti_ray_end(ray, DIST_RAY_HIT, ray->s, ray->f, ray->f / tracer->lipschitz + ray->b - ray->a);
-        float s = ray->s, f = ray->f;
-        ray->s = ray->b;
-        ray->f = ray->fb;
-        ray->b = s;
-        ray->fb = f;
-        ray->a = ray->s;
-        ray->fa = ray->f;
+        disti_sample lowest = ray->front;
+        if (sheet || (!flat && lowest.f <= tracer->noise))
+            return disti_ray_end(ray, DIST_RAY_HIT, lowest.s, lowest.f,
+                                 lowest.f / tracer->lipschitz + ray->b.s - ray->a.s);
+        ray->front = ray->a = ray->b;
+        ray->b = lowest;
         ray->slope = right;
         ray->moved = ray->known = 1;
-        if (ray->s >= ray->leave) return disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest * ray->sign, 0.0f);
-        if (ray->f < 4.0f * epsilon) return disti_ray_feel(tracer, ray, epsilon);
-        ray->fb = 0.0f; /* the band is over */
+        if (ray->front.s >= ray->leave) return disti_ray_miss(ray);
+        if (ray->front.f < 4.0f * epsilon) return disti_ray_feel(tracer, ray, epsilon);
+        ray->b.f = 0.0f; /* the band is over */
         return disti_ray_step(tracer, ray);
     }
     float least = 2.4e-7f * tracer->field->radius, steeper = DISTI_MAX(left, right), shift = 0.0f;
-    if (ray->moved % 3 == 1 && steeper > 0.0f) shift = 0.5f * ((ray->fa - ray->fb) / steeper + after - before);
+    if (ray->moved % 3 == 1 && steeper > 0.0f) shift = 0.5f * ((ray->a.f - ray->b.f) / steeper + after - before);
     else if (ray->moved % 3 == 2 && steeper > 0.0f) shift = 0.5f * (left * after - right * before) / (left + right);
     if ((shift < 0.0f ? -shift : shift) < least) shift = after > before ? 0.38f * after : -0.38f * before;
     ray->moved++;
-    return disti_ray_ask(ray, DISTI_LEAST, ray->s + shift);
+    return disti_ray_ask(ray, DISTI_LEAST, ray->front.s + shift);
 }
 
-static int disti_ray_leasted(const disti_tracer *tracer, disti_ray *ray, float f)
+static int disti_ray_leasted(const disti_tracer *tracer, disti_ray *ray, disti_sample now)
 {
-    float q = ray->q;
-    if (f <= 0.0f) {
-        if (q < ray->s) return disti_ray_open_bracket(tracer, ray, ray->a, ray->fa, q, f);
-        return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, q, f);
-    }
-    int lower = f < ray->f, beyond = q > ray->s;
-    if (lower != beyond) { /* the new end is b */
-        ray->b = lower ? ray->s : q;
-        ray->fb = lower ? ray->f : f;
-    } else {
-        ray->a = lower ? ray->s : q;
-        ray->fa = lower ? ray->f : f;
-    }
-    if (lower) {
-        ray->s = q;
-        ray->f = f;
-    }
+    int beyond = now.s > ray->front.s, lower = now.f < ray->front.f;
+    if (now.f <= 0.0f) return disti_ray_open_bracket(tracer, ray, now.s < ray->front.s ? ray->a : ray->front, now);
+    disti_sample end = lower ? ray->front : now;
+    if (lower != beyond) ray->b = end;
+    else ray->a = end;
+    if (lower) ray->front = now;
     return disti_ray_least(tracer, ray);
 }
 
 /* A certified ray leaves the band by where it came to no more than f's noise: through a sheet thinner than floats can
-   tell, or past a solid nearer than that. That is a hit at the least f, and off by no more
-   than the noise over the mean slope from the last sample well above it. Returns whether it is one. */
+   tell, or past a solid nearer than that. That is a hit at the least f, off by no more than the noise over the mean
+   slope from the last sample well above it. Returns whether it is one. */
 static int disti_ray_sheet(const disti_tracer *tracer, disti_ray *ray)
 {
-    float least = ray->fbest * ray->sign, way = ray->best - ray->crept;
-    if (!(ray->moved && ray->fcrept > 0.0f && way > 0.0f && least <= tracer->noise)) return 0;
-    ray->slope = (least - ray->fcrept) / way;
+    float least = ray->fbest * ray->sign, way = ray->best - ray->crept.s;
+    if (!(ray->moved && ray->crept.f > 0.0f && way > 0.0f && least <= tracer->noise)) return 0;
+    ray->slope = (least - ray->crept.f) / way;
     float error = 4.8e-7f * tracer->field->radius - tracer->noise / ray->slope;
     disti_ray_end(ray, DIST_RAY_HIT, ray->best, least, error);
     return 1;
@@ -10075,46 +10058,45 @@ static int disti_ray_sheet(const disti_tracer *tracer, disti_ray *ray)
 
 /* 0 < f < epsilon at the front: the surface is near, if not hit. Leaving the band again (by 4 epsilon) without a
    crossing was no hit, nor is it the surface that the ray began at. f that does not change at all is a plateau. The
-   band's first sample stands in a, fa, the last but one in b, fb. */
-static int disti_ray_band(const disti_tracer *tracer, disti_ray *ray, float f)
+   band's first sample stands in a, the last but one in b. */
+static int disti_ray_band(const disti_tracer *tracer, disti_ray *ray, disti_sample now)
 {
-    float epsilon = disti_ray_near(tracer, ray, ray->s);
-    float slope = (f - ray->f) / DISTI_MAX(ray->q - ray->s, 1e-30f);
-    if (f <= 0.0f && ray->f > 0.0f) return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->q, f);
-    if (f < 0.0f)
-        return disti_ray_end(ray, DIST_RAY_HIT, ray->s, 0.0f, 0.0f); /* the start is the surface, to the last bit */
+    disti_sample last = ray->front;
+    float epsilon = disti_ray_near(tracer, ray, last.s);
+    float step = now.s - last.s;
+    if (now.f <= 0.0f && last.f > 0.0f) return disti_ray_open_bracket(tracer, ray, last, now);
+    if (now.f < 0.0f)
+        return disti_ray_end(ray, DIST_RAY_HIT, last.s, 0.0f, 0.0f); /* the start is the surface, to the last bit */
     if (ray->side < 255) ray->side++;
-    if (f < 0.5f * ray->fa) ray->moved = 1; /* toward another surface than the one that it began at */
-    float fall = ray->b < ray->s ? (ray->fb - ray->f) / (ray->s - ray->b) * (ray->q - ray->s) : 0.0f; /* as before */
-    if (ray->moved && fall > 0.0f && !tracer->how.certified && (f >= ray->f || (f > 0.8f * ray->f && fall > ray->f))) {
+    if (now.f < 0.5f * ray->a.f) ray->moved = 1; /* toward another surface than the one that it began at */
+    float fall = ray->b.s < last.s ? (ray->b.f - last.f) / (last.s - ray->b.s) * step : 0.0f; /* as before */
+    int rises = now.f >= last.f || (now.f > 0.8f * last.f && fall > last.f);
+    if (ray->moved && fall > 0.0f && !tracer->how.certified && rises) {
         ray->a = ray->b;
-        ray->fa = ray->fb;
-        ray->b = ray->q;
-        ray->fb = f;
+        ray->b = now;
         return disti_ray_least(tracer, ray);
     }
-    if (ray->q >= ray->leave) return disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest * ray->sign, 0.0f);
-    float change = ray->fa - f, all = ray->q - ray->a;
-    ray->b = ray->s;
-    ray->fb = ray->f;
-    ray->s = ray->q;
-    ray->f = f;
-    ray->slope = slope;
-    if (f >= 4.0f * epsilon) {
+    if (now.s >= ray->leave) return disti_ray_miss(ray);
+    float change = ray->a.f - now.f, all = now.s - ray->a.s;
+    ray->b = last;
+    ray->front = now;
+    ray->slope = (now.f - last.f) / DISTI_MAX(step, 1e-30f);
+    if (now.f >= 4.0f * epsilon) {
         if (tracer->how.certified && disti_ray_sheet(tracer, ray)) return 0;
         ray->known = 1;
-        ray->fb = 0.0f; /* the band is over */
+        ray->b.f = 0.0f; /* the band is over */
         return disti_ray_step(tracer, ray);
     }
     if (tracer->how.certified) { /* on until the steps are spent */
-        float rise = f - fabsf(ray->fbest); /* beyond the rounding of numbers of the radius's size: no plateau */
+        float rise = now.f - fabsf(ray->fbest); /* beyond the rounding of numbers of the radius's size: no plateau */
         int flat = change < 1e-3f * all && rise <= 1.2e-7f * tracer->field->radius;
-        int zeros = ray->steps >= 1000 && f == 0.0f && change == 0.0f; /* a network of zeros */
-        int last = (ray->steps + 1 >= tracer->how.max_steps && flat) || zeros;
-        return last ? disti_ray_end(ray, DIST_RAY_PLATEAU, ray->s, f, 0.0f) : disti_ray_feel(tracer, ray, epsilon);
+        int zeros = ray->steps >= 1000 && now.f == 0.0f && change == 0.0f; /* a network of zeros */
+        int ends = (ray->steps + 1 >= tracer->how.max_steps && flat) || zeros;
+        return ends ? disti_ray_end(ray, DIST_RAY_PLATEAU, now.s, now.f, 0.0f) : disti_ray_feel(tracer, ray, epsilon);
     }
-    if (ray->side >= 16 && !(change >= 1e-3f * all)) return disti_ray_end(ray, DIST_RAY_PLATEAU, ray->s, f, 0.0f);
-    if (ray->side >= 16 && f <= tracer->noise) return disti_ray_end(ray, DIST_RAY_HIT, ray->s, f, f * all / change);
+    if (ray->side >= 16 && !(change >= 1e-3f * all)) return disti_ray_end(ray, DIST_RAY_PLATEAU, now.s, now.f, 0.0f);
+    if (ray->side >= 16 && now.f <= tracer->noise)
+        return disti_ray_end(ray, DIST_RAY_HIT, now.s, now.f, now.f * all / change);
     if (ray->side >= 48) return disti_ray_give_up(ray); /* it falls, but to where? */
     return disti_ray_feel(tracer, ray, epsilon);
 }
@@ -10124,11 +10106,11 @@ static int disti_ray_inside(const disti_tracer *tracer, disti_ray *ray, float f)
 {
     if (tracer->how.inside != DIST_INSIDE_EXIT) return disti_ray_end(ray, DIST_RAY_INSIDE, ray->enter, f, 0.0f);
     ray->sign = -ray->sign;
-    ray->s = ray->enter;
-    ray->f = -f;
+    ray->front.s = ray->enter;
+    ray->front.f = -f;
     ray->best = ray->enter;
     ray->fbest = f;
-    ray->slope = ray->fa = ray->fb = 0.0f; /* what was found beyond was so with the other sign */
+    ray->slope = ray->a.f = ray->b.f = 0.0f; /* what was found beyond was so with the other sign */
     ray->known = 0;
     return disti_ray_step(tracer, ray);
 }
@@ -10137,15 +10119,15 @@ static int disti_ray_inside(const disti_tracer *tracer, disti_ray *ray, float f)
    make it: else something nearer is about. */
 static int disti_ray_aims(const disti_tracer *tracer, const disti_ray *ray, float f)
 {
-    float far = -ray->incline * (ray->target - ray->s);
-    return ray->aim && far > 0.0f && far <= f + 1e-3f * tracer->field->radius && !(ray->fb < 0.0f);
+    float far = -ray->incline * (ray->target - ray->front.s);
+    return ray->aim && far > 0.0f && far <= f + 1e-3f * tracer->field->radius && !(ray->b.f < 0.0f);
 }
 
 static int disti_ray_aim(disti_ray *ray)
 {
     ray->side = ray->aim == 2;
     ray->aim = 0;
-    ray->fa = 3e38f;
+    ray->a.f = 3e38f;
     return disti_ray_ask(ray, DISTI_PREDICT, ray->target);
 }
 
@@ -10165,194 +10147,178 @@ static float disti_newton_error(const disti_tracer *tracer, float epsilon, float
    as these are alike (it is off by about its length times 3 % and half of what they differ), the others, and any for a
    sample that came with its gradient, by its own. A step too long to trust, or f that does not shrink, sends the ray
    back to its front. At a grazing angle only a sample behind the surface shows that the ray does not pass it by. */
-static int disti_ray_predicted(const disti_tracer *tracer, disti_ray *ray, float f)
+static int disti_ray_predicted(const disti_tracer *tracer, disti_ray *ray, disti_sample now)
 {
-    float epsilon = disti_ray_epsilon(tracer, ray, ray->q);
-    int first = ray->fa > 2e38f, fronted = ray->f > 0.0f, foreign = first && !ray->own;
-    float slope = first || ray->own ? ray->incline : (f - ray->fa) / (ray->q - ray->a);
-    float step = -f / slope, length = step < 0.0f ? -step : step;
-    float magnitude = f < 0.0f ? -f : f, before = ray->fa < 0.0f ? -ray->fa : ray->fa;
-    int far = 2.0f * (float)(ray->base + (double)ray->q) * ray->footprint > 0.01f * tracer->field->radius;
-    if (first && fronted && f > 0.0f) before = 0.5f * ray->f; /* the front's: it fell, or it ends elsewhere */
+    float epsilon = disti_ray_epsilon(tracer, ray, now.s);
+    int first = ray->a.f > 2e38f, fronted = ray->front.f > 0.0f, foreign = first && !ray->own;
+    float slope = first || ray->own ? ray->incline : (now.f - ray->a.f) / (now.s - ray->a.s);
+    float step = -now.f / slope, length = step < 0.0f ? -step : step;
+    float magnitude = now.f < 0.0f ? -now.f : now.f, before = ray->a.f < 0.0f ? -ray->a.f : ray->a.f;
+    int far = 2.0f * (float)(ray->base + (double)now.s) * ray->footprint > 0.01f * tracer->field->radius;
+    if (first && fronted && now.f > 0.0f) before = 0.5f * ray->front.f; /* the front's: it fell, or it ends elsewhere */
     int good = slope < -0.05f * tracer->lipschitz && length < 0.03f * tracer->detail && magnitude < before &&
                ray->side < 5;
-    int ends = f < epsilon || slope < -0.3f * tracer->lipschitz; /* else f may flatten out before it is 0 */
-    if (f > 0.0f && slope > -0.12f * tracer->lipschitz) { /* as it does beside an outline */
+    int ends = now.f < epsilon || slope < -0.3f * tracer->lipschitz; /* else f may flatten out before it is 0 */
+    if (now.f > 0.0f && slope > -0.12f * tracer->lipschitz) { /* as it does beside an outline */
         ends = 0;
         step *= 1.2f;
     }
     float most = foreign ? ray->width : far ? 1.0f : 12.0f;
     if (good && ends && (!foreign || ray->width > 0.0f) && length <= most * epsilon) {
-        float off = ray->q + step - ray->target;
+        float off = now.s + step - ray->target;
         ray->slope = slope;
-        if (length > 0.125f * (float)(ray->base + (double)ray->q) * ray->footprint) ray->own = 0; /* of a pixel: 1/16 */
+        if (length > 0.125f * (float)(ray->base + (double)now.s) * ray->footprint) ray->own = 0; /* of a pixel: 1/16 */
         ray->off = DISTI_MAX(off < 0.0f ? -off : off, 1e-9f);
         float error = disti_newton_error(tracer, epsilon, slope, length, ray->own);
-        return disti_ray_end(ray, DIST_RAY_HIT, ray->q + step, f, error);
+        return disti_ray_end(ray, DIST_RAY_HIT, now.s + step, now.f, error);
     }
-    if (!good || ray->q + step <= (fronted ? ray->s : ray->start) || ray->q + step >= ray->leave) {
-        if (f < 0.0f && !(ray->fb < 0.0f)) {
-            ray->b = ray->q;
-            ray->fb = f;
-        }
-        ray->fa = 0.0f;
+    if (!good || now.s + step <= (fronted ? ray->front.s : ray->start) || now.s + step >= ray->leave) {
+        if (now.f < 0.0f && !(ray->b.f < 0.0f)) ray->b = now;
+        ray->a.f = 0.0f;
         ray->side = 0;
         return fronted ? disti_ray_step(tracer, ray) : disti_ray_ask(ray, DISTI_FIRST, ray->start);
     }
-    ray->a = ray->q;
-    ray->fa = f;
+    ray->a = now;
     ray->side++;
-    return disti_ray_ask(ray, DISTI_PREDICT, ray->q + step);
+    return disti_ray_ask(ray, DISTI_PREDICT, now.s + step);
 }
 
 /* The front is near the surface: is it hit? */
 static int disti_ray_arrive(const disti_tracer *tracer, disti_ray *ray)
 {
-    if (ray->fb < 0.0f && ray->b > ray->s) { /* what is near need not be what is at b */
-        if (!disti_ray_alone(tracer, ray, ray->s, ray->f, ray->b, ray->fb, 2e-3f)) return disti_ray_step(tracer, ray);
-        return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->b, ray->fb);
+    if (ray->b.f < 0.0f && ray->b.s > ray->front.s) { /* what is near need not be what is at b */
+        if (!disti_ray_alone(tracer, ray, ray->front, ray->b, 2e-3f)) return disti_ray_step(tracer, ray);
+        return disti_ray_open_bracket(tracer, ray, ray->front, ray->b);
     }
-    float epsilon = disti_ray_near(tracer, ray, ray->s);
+    float epsilon = disti_ray_near(tracer, ray, ray->front.s);
     ray->side = 0;
     ray->moved = ray->slope < 0.0f; /* came down to here from farther out: from a, or where f was epsilon */
-    ray->b = ray->fa > 0.0f ? ray->a : ray->s;
-    ray->fb = ray->fa > 0.0f ? ray->fa : ray->f;
-    if (ray->moved && !(ray->fa > 0.0f)) {
-        ray->b += (epsilon - ray->f) / ray->slope;
-        ray->fb = epsilon;
+    ray->b = ray->a.f > 0.0f ? ray->a : ray->front;
+    if (ray->moved && !(ray->a.f > 0.0f)) {
+        ray->b.s += (epsilon - ray->front.f) / ray->slope;
+        ray->b.f = epsilon;
     }
-    ray->a = ray->s;
-    ray->fa = ray->f;
+    ray->a = ray->front;
     return disti_ray_feel(tracer, ray, epsilon);
 }
 
 /* On from a new front. */
 static int disti_ray_onward(const disti_tracer *tracer, disti_ray *ray)
 {
-    if (ray->f < disti_ray_near(tracer, ray, ray->s)) return disti_ray_arrive(tracer, ray);
-    if (ray->s >= ray->leave) return disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest * ray->sign, 0.0f);
-    return disti_ray_aims(tracer, ray, ray->f) ? disti_ray_aim(ray) : disti_ray_step(tracer, ray);
+    if (ray->front.f < disti_ray_near(tracer, ray, ray->front.s)) return disti_ray_arrive(tracer, ray);
+    if (ray->front.s >= ray->leave) return disti_ray_miss(ray);
+    return disti_ray_aims(tracer, ray, ray->front.f) ? disti_ray_aim(ray) : disti_ray_step(tracer, ray);
 }
 
 /* The first sample of a ray, or a second one before it. */
-static int disti_ray_first(const disti_tracer *tracer, disti_ray *ray, float f)
+static int disti_ray_first(const disti_tracer *tracer, disti_ray *ray, disti_sample now)
 {
-    float q = ray->q;
-    if (f < 0.0f && q <= ray->enter) return disti_ray_inside(tracer, ray, f);
-    if (f < 0.0f) { /* the cone came too far: the Lipschitz figure was too small here */
-        ray->b = q;
-        ray->fb = f;
-        ray->width = DISTI_MAX(1.5f * -f / tracer->lipschitz, disti_ray_epsilon(tracer, ray, q));
-        return disti_ray_ask(ray, DISTI_BACK, DISTI_MAX(q - ray->width, ray->enter));
+    if (now.f < 0.0f && now.s <= ray->enter) return disti_ray_inside(tracer, ray, now.f);
+    if (now.f < 0.0f) { /* the cone came too far: the Lipschitz figure was too small here */
+        ray->b = now;
+        ray->width = DISTI_MAX(1.5f * -now.f / tracer->lipschitz, disti_ray_epsilon(tracer, ray, now.s));
+        return disti_ray_ask(ray, DISTI_BACK, DISTI_MAX(now.s - ray->width, ray->enter));
     }
-    ray->s = q;
-    ray->f = f;
-    ray->slope = ray->fa = 0.0f;
+    ray->front = now;
+    ray->slope = ray->a.f = 0.0f;
     ray->known = 0;
-    disti_ray_creeps(tracer, ray, f, 0);
-    if (ray->fb > 0.0f) { /* the second query */
-        ray->a = q;
-        ray->fa = f;
-        ray->s = ray->b;
-        ray->f = ray->fb;
-        ray->slope = (ray->f - f) / (ray->b - q);
+    disti_ray_creeps(tracer, ray, now, 0);
+    float near = disti_ray_near(tracer, ray, now.s);
+    if (ray->b.f > 0.0f) { /* the second query */
+        ray->a = now;
+        ray->front = ray->b;
+        ray->slope = (ray->b.f - now.f) / (ray->b.s - now.s);
         ray->known = 1;
-        ray->fb = 0.0f;
-    } else if (f < disti_ray_near(tracer, ray, q) && q > ray->enter && !(ray->fb < 0.0f)) {
-        ray->b = q; /* cones or other rays' spheres led up to this: does f fall toward it? One looks from before */
-        ray->fb = DISTI_MAX(f, 1e-30f); /* 0: none */
-        return disti_ray_ask(ray, DISTI_FIRST, DISTI_MAX(q - 4.0f * disti_ray_near(tracer, ray, q), ray->enter));
+        ray->b.f = 0.0f;
+    } else if (now.f < near && now.s > ray->enter && !(ray->b.f < 0.0f)) {
+        ray->b = now; /* cones or other rays' spheres led up to this: does f fall toward it? One looks from before */
+        ray->b.f = DISTI_MAX(now.f, 1e-30f); /* 0: none */
+        return disti_ray_ask(ray, DISTI_FIRST, DISTI_MAX(now.s - 4.0f * near, ray->enter));
     }
     return disti_ray_onward(tracer, ray);
 }
 
 /* A sample farther back than one in a solid. */
-static int disti_ray_backed(const disti_tracer *tracer, disti_ray *ray, float f)
+static int disti_ray_backed(const disti_tracer *tracer, disti_ray *ray, disti_sample now)
 {
-    if (f >= 0.0f) return disti_ray_open_bracket(tracer, ray, ray->q, f, ray->b, ray->fb);
-    if (ray->q <= ray->enter) return disti_ray_inside(tracer, ray, f);
-    ray->b = ray->q;
-    ray->fb = f;
+    if (now.f >= 0.0f) return disti_ray_open_bracket(tracer, ray, now, ray->b);
+    if (now.s <= ray->enter) return disti_ray_inside(tracer, ray, now.f);
+    ray->b = now;
     ray->width *= 1.6f;
-    return disti_ray_ask(ray, DISTI_BACK, DISTI_MAX(ray->q - ray->width, ray->enter));
+    return disti_ray_ask(ray, DISTI_BACK, DISTI_MAX(now.s - ray->width, ray->enter));
 }
 
 /* A step of the sphere at the front alone, with ray->slope known. */
 static int disti_ray_retry(const disti_tracer *tracer, disti_ray *ray)
 {
-    float step = DISTI_MAX(disti_empty(tracer, ray->f), 4.8e-7f * tracer->field->radius);
-    return disti_ray_ask(ray, DISTI_MARCH, DISTI_MIN(ray->s + step, ray->leave));
+    float step = DISTI_MAX(disti_empty(tracer, ray->front.f), 4.8e-7f * tracer->field->radius);
+    return disti_ray_ask(ray, DISTI_MARCH, DISTI_MIN(ray->front.s + step, ray->leave));
 }
 
 /* df/ds between two samples; where f is clamped none is known, and none foretells a surface. */
-static float disti_ray_slope(const disti_tracer *tracer, float f, float next, float step)
+static float disti_ray_slope(const disti_tracer *tracer, disti_sample from, disti_sample to)
 {
-    float clamp = tracer->field->clamp > 0.0f ? 0.98f * tracer->field->clamp : 3e38f, slope = (next - f) / step;
-    return f > clamp || next > clamp ? DISTI_MAX(slope, 0.0f) : slope;
+    float clamp = tracer->field->clamp > 0.0f ? 0.98f * tracer->field->clamp : 3e38f;
+    float slope = (to.f - from.f) / (to.s - from.s);
+    return from.f > clamp || to.f > clamp ? DISTI_MAX(slope, 0.0f) : slope;
 }
 
-/* The front moves to the sample at q, and on to one beyond it if nothing fits between. */
-static void disti_ray_move(const disti_tracer *tracer, disti_ray *ray, float f)
+/* The front moves to the new sample, and on to one beyond it if nothing fits between. */
+static void disti_ray_move(const disti_tracer *tracer, disti_ray *ray, disti_sample now)
 {
-    float q = ray->q;
-    ray->a = ray->s;
-    ray->fa = ray->mode == DISTI_SKIP ? 0.0f : ray->f;
-    ray->slope = disti_ray_slope(tracer, ray->f, f, q - ray->s);
-    ray->s = q;
-    ray->f = f;
+    ray->a = ray->front;
+    if (ray->mode == DISTI_SKIP) ray->a.f = 0.0f;
+    ray->slope = disti_ray_slope(tracer, ray->front, now);
+    ray->front = now;
     ray->known = 1;
-    if (ray->fb > 0.0f && ray->b > q && ray->b - q <= disti_empty(tracer, f) + disti_empty(tracer, ray->fb)) {
-        ray->slope = disti_ray_slope(tracer, f, ray->fb, ray->b - q);
-        ray->s = ray->b;
-        ray->f = ray->fb;
-        ray->fa = 0.0f;
+    float gap = ray->b.s - now.s;
+    if (ray->b.f > 0.0f && gap > 0.0f && gap <= disti_empty(tracer, now.f) + disti_empty(tracer, ray->b.f)) {
+        ray->slope = disti_ray_slope(tracer, now, ray->b);
+        ray->front = ray->b;
+        ray->a.f = 0.0f;
     }
-    if (ray->b <= q) ray->fb = 0.0f;
+    if (gap <= 0.0f) ray->b.f = 0.0f;
 }
 
-/* A step of the march from the front to q. */
-static int disti_ray_marched(const disti_tracer *tracer, disti_ray *ray, float f)
+/* A step of the march from the front to a new sample. */
+static int disti_ray_marched(const disti_tracer *tracer, disti_ray *ray, disti_sample now)
 {
-    float q = ray->q, radius = disti_empty(tracer, ray->f), step = q - ray->s;
-    if (ray->fb < 0.0f && f > 0.0f && q < ray->b && ++ray->side >= 3 && !tracer->how.certified &&
-        (ray->side >= 8 || disti_ray_alone(tracer, ray, q, f, ray->b, ray->fb, 2e-3f)))
-        return disti_ray_open_bracket(tracer, ray, q, f, ray->b, ray->fb);
-    float gap = step - radius - disti_empty(tracer, f < 0.0f ? -f : f); /* what neither sphere covers */
+    float f = now.f, radius = disti_empty(tracer, ray->front.f), step = now.s - ray->front.s;
+    if (ray->b.f < 0.0f && f > 0.0f && now.s < ray->b.s && ++ray->side >= 3 && !tracer->how.certified &&
+        (ray->side >= 8 || disti_ray_alone(tracer, ray, now, ray->b, 2e-3f)))
+        return disti_ray_open_bracket(tracer, ray, now, ray->b);
+    float gap = step - radius - disti_empty(tracer, fabsf(f)); /* what neither sphere covers */
     if (tracer->how.certified) gap += 2.0f * tracer->noise / tracer->lipschitz; /* spheres touch at a flat sheet */
     float sphere = (tracer->how.certified ? 1.0f : 1.0001f) * radius + 4.8e-7f * tracer->field->radius;
     int back = ray->mode != DISTI_SKIP && step > sphere;
-    float off = f - (ray->f + ray->slope * step);
-    int foretold = ray->known && (off < 0.0f ? -off : off) < 0.5f * (off - f); /* as deep as expected */
+    float off = f - (ray->front.f + ray->slope * step);
+    int foretold = ray->known && fabsf(off) < 0.5f * (off - f); /* as deep as expected */
     float room = (foretold ? 2e-2f : 1e-3f) * tracer->detail;
-    if (tracer->how.certified) room = disti_ray_epsilon(tracer, ray, ray->s);
-    if (f <= 0.0f && !(back && gap > room)) return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, q, f);
+    if (tracer->how.certified) room = disti_ray_epsilon(tracer, ray, ray->front.s);
+    if (f <= 0.0f && !(back && gap > room)) return disti_ray_open_bracket(tracer, ray, ray->front, now);
     if (back && (f <= 0.0f || (gap > 0.0f && !disti_ray_trusts(tracer, ray, f, step)))) {
-        float slope = (f - ray->f) / step; /* something may hide in the gap: back, and keep the far sample */
+        float slope = (f - ray->front.f) / step; /* something may hide in the gap: back, and keep the far sample */
         ray->slope = DISTI_MAX(slope, -tracer->lipschitz);
         ray->known = 1;
-        if (f <= 0.0f || !(ray->fb < 0.0f)) {
+        if (f <= 0.0f || !(ray->b.f < 0.0f)) {
             ray->side = 0;
-            ray->b = q;
-            ray->fb = f;
+            ray->b = now;
         }
         return disti_ray_retry(tracer, ray);
     }
     if (disti_ray_doubts(tracer, ray, f, step)) { /* back to where the last step began, and keep where it ended */
-        ray->slope = (ray->f - ray->fa) / (ray->s - ray->a);
-        ray->b = ray->s;
-        ray->fb = ray->f;
-        ray->s = ray->a;
-        ray->f = ray->fa;
-        ray->fa = 0.0f;
+        ray->slope = (ray->front.f - ray->a.f) / (ray->front.s - ray->a.s);
+        ray->b = ray->front;
+        ray->front = ray->a;
+        ray->a.f = 0.0f;
         return disti_ray_retry(tracer, ray);
     }
-    disti_ray_creeps(tracer, ray, f, back && gap > 0.0f);
-    if (ray->fb < 0.0f) { /* a crossing lies before b: is there room for another before it? */
-        if (ray->b <= q) return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->b, ray->fb);
-        if (disti_ray_alone(tracer, ray, q, f, ray->b, ray->fb, 1e-3f))
-            return disti_ray_open_bracket(tracer, ray, q, f, ray->b, ray->fb);
+    disti_ray_creeps(tracer, ray, now, back && gap > 0.0f);
+    if (ray->b.f < 0.0f) { /* a crossing lies before b: is there room for another before it? */
+        if (ray->b.s <= now.s) return disti_ray_open_bracket(tracer, ray, ray->front, ray->b);
+        if (disti_ray_alone(tracer, ray, now, ray->b, 1e-3f)) return disti_ray_open_bracket(tracer, ray, now, ray->b);
     }
-    disti_ray_move(tracer, ray, f);
+    disti_ray_move(tracer, ray, now);
     return disti_ray_onward(tracer, ray);
 }
 
@@ -10366,27 +10332,27 @@ static void disti_keep_least(disti_ray *ray, float s, float f)
 /* One sample f at ray->q: what follows from it. 1: another query at ray->q; 0: done, ray->status says how. */
 static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float sample)
 {
-    float f = sample * ray->sign, q = ray->q;
-    if (!disti_finite(sample)) return disti_ray_end(ray, DIST_RAY_NOT_FINITE, q, 0.0f, 0.0f);
-    disti_keep_least(ray, q, sample);
-    ray->steps++;
-    if (tracer->how.any_hit && f < 0.0f && ray->mode != DISTI_FIRST)
-        return disti_ray_end(ray, DIST_RAY_HIT, q, f, q - ray->s);
+    disti_sample now = {ray->q, sample * ray->sign};
+    if (!disti_finite(sample)) return disti_ray_end(ray, DIST_RAY_NOT_FINITE, now.s, 0.0f, 0.0f);
+    disti_keep_least(ray, now.s, sample);
+    int spent = ++ray->steps >= tracer->how.max_steps && now.f > 0.0f;
+    if (tracer->how.any_hit && now.f < 0.0f && ray->mode != DISTI_FIRST)
+        return disti_ray_end(ray, DIST_RAY_HIT, now.s, now.f, now.s - ray->front.s);
     if (ray->mode == DISTI_BRACKET) {
-        if (ray->steps < tracer->how.max_steps + 40) return disti_ray_bracketed(tracer, ray, f);
-        return disti_ray_end(ray, DIST_RAY_HIT, 0.5f * (ray->a + ray->b), 0.0f, ray->b - ray->a);
+        if (ray->steps < tracer->how.max_steps + 40) return disti_ray_bracketed(tracer, ray, now);
+        return disti_ray_end(ray, DIST_RAY_HIT, 0.5f * (ray->a.s + ray->b.s), 0.0f, ray->b.s - ray->a.s);
     }
-    if (ray->steps >= tracer->how.max_steps && f > 0.0f && ray->mode != DISTI_BAND && ray->fb < 0.0f && ray->b > ray->s)
-        return disti_ray_open_bracket(tracer, ray, ray->s, ray->f, ray->b, ray->fb);
-    if (ray->steps >= tracer->how.max_steps && f > 0.0f) return disti_ray_give_up(ray);
+    if (spent && ray->mode != DISTI_BAND && ray->b.f < 0.0f && ray->b.s > ray->front.s)
+        return disti_ray_open_bracket(tracer, ray, ray->front, ray->b);
+    if (spent) return disti_ray_give_up(ray);
     switch (ray->mode) {
-    case DISTI_FIRST: return disti_ray_first(tracer, ray, f);
-    case DISTI_BACK: return disti_ray_backed(tracer, ray, f);
-    case DISTI_BAND: return disti_ray_band(tracer, ray, f);
-    case DISTI_LEAST: return disti_ray_leasted(tracer, ray, f);
-    case DISTI_PREDICT: return disti_ray_predicted(tracer, ray, f);
+    case DISTI_FIRST: return disti_ray_first(tracer, ray, now);
+    case DISTI_BACK: return disti_ray_backed(tracer, ray, now);
+    case DISTI_BAND: return disti_ray_band(tracer, ray, now);
+    case DISTI_LEAST: return disti_ray_leasted(tracer, ray, now);
+    case DISTI_PREDICT: return disti_ray_predicted(tracer, ray, now);
     }
-    return disti_ray_marched(tracer, ray, f); /* DISTI_MARCH, DISTI_SKIP, DISTI_JUMP */
+    return disti_ray_marched(tracer, ray, now); /* DISTI_MARCH, DISTI_SKIP, DISTI_JUMP */
 }
 
 /* A worker's share of the tracer's memory. */
@@ -10697,12 +10663,12 @@ static int disti_skip(const disti_tracer *tracer, const disti_bench *bench, int 
 {
     if (ray->mode != DISTI_FIRST && ray->mode != DISTI_MARCH && ray->mode != DISTI_SKIP) return 1;
     int begins = ray->mode == DISTI_FIRST;
-    if (begins && ray->fb > 0.0f) return 1; /* it has been there */
-    float s = begins ? ray->q : ray->s;
+    if (begins && ray->b.f > 0.0f) return 1; /* it has been there */
+    float s = begins ? ray->q : ray->front.s;
     if (bench->balls) s = disti_covered(bench, index, ray, s);
     if (tracer->cache && ray->sign > 0.0f) /* on the way out what is empty is what it looks for */
-        s = disti_cache_walk(tracer, ray, s, begins ? s : ray->s + disti_empty(tracer, ray->f));
-    if (s >= ray->leave) return disti_ray_end(ray, DIST_RAY_MISS, ray->best, ray->fbest * ray->sign, 0.0f);
+        s = disti_cache_walk(tracer, ray, s, begins ? s : ray->front.s + disti_empty(tracer, ray->front.f));
+    if (s >= ray->leave) return disti_ray_miss(ray);
     if (s <= ray->q) return 1;
     ray->q = s;
     if (begins) ray->start = s;
@@ -10723,8 +10689,8 @@ DISTI_INLINE void disti_stats_slope(const disti_tracer *tracer, const disti_ray 
 {
     int bracket = ray->mode == DISTI_BRACKET || ray->mode == DISTI_LEAST, back = ray->mode == DISTI_BACK;
     if (ray->mode <= DISTI_FIRST || ray->mode == DISTI_PREDICT) return;
-    float from = (bracket ? ray->fa : back ? ray->fb : ray->f) * ray->sign;
-    float step = back ? ray->b - ray->q : ray->q - (bracket ? ray->a : ray->s);
+    float from = (bracket ? ray->a.f : back ? ray->b.f : ray->front.f) * ray->sign;
+    float step = back ? ray->b.s - ray->q : ray->q - (bracket ? ray->a.s : ray->front.s);
     float change = f > from ? f - from : from - f, noise = 2.0f * tracer->noise;
     if (!(change * DISTI_MAX(tracer->ratio, 1.0f) > tracer->lipschitz * step + noise) || !(step > 0.0f)) return;
     float e0 = disti_empty(tracer, from < 0.0f ? -from : from), e1 = disti_empty(tracer, f < 0.0f ? -f : f);
@@ -12335,7 +12301,7 @@ static int disti_predict(const disti_tracer *tracer, const disti_tile *tile, con
     if (near && guess.quality >= 2 && guess.slope < -0.12f * tracer->lipschitz) /* else 0: a second query makes sure */
         ray->width = guess.slope < -0.3f * tracer->lipschitz ? DISTI_MAX(4.0f, 0.35f / (0.03f + 0.5f * guess.spread))
                                                              : 1.0f;
-    ray->s = ray->start;
+    ray->front.s = ray->start;
     if (guess.quality > 0 && disti_ray_aims(tracer, ray, ray->guard - 1e-3f * tracer->field->radius)) {
         int alike = guess.off <= 0.5f * epsilon || (guess.off <= 2.0f * epsilon && guess.differ <= 0.5f * epsilon);
         if (near && h == 1 && guess.quality == 3 && guess.off > 0.0f && alike) {
@@ -12641,7 +12607,7 @@ static void disti_minima_want_fit(disti_minima *m, int index, float width)
 }
 
 /* Parabolas through three samples around the least one of the rays in `fits`; width: how far apart, in units of f. Both
-   sides are asked for in one call, then where the parabola is least; fb is its value there. Beyond a side f falls
+   sides are asked for in one call, then where the parabola is least; b.f is its value there. Beyond a side f falls
    farther, and the ray stays in the list: twice as wide, around that side. */
 static void disti_minima_parabolas(disti_minima *m)
 {
@@ -12652,27 +12618,27 @@ static void disti_minima_parabolas(disti_minima *m)
         for (; i < m->fit_count && count + 2 <= (size_t)DISTI_TILE_RAYS; i++) {
             disti_ray *ray = &bench->rays[m->fits[i]];
             ray->width = DISTI_MAX(ray->width * ray->fbest, 2e-3f * m->radius);
-            ray->a = ray->best; /* the least sample as it stood */
-            ray->fa = ray->fbest;
-            count = disti_minima_list(m, m->fits[i], ray->a - ray->width, count);
-            count = disti_minima_list(m, m->fits[i], ray->a + ray->width, count);
+            ray->a.s = ray->best; /* the least sample as it stood */
+            ray->a.f = ray->fbest;
+            count = disti_minima_list(m, m->fits[i], ray->a.s - ray->width, count);
+            count = disti_minima_list(m, m->fits[i], ray->a.s + ray->width, count);
         }
         size_t asked = disti_minima_eval(m, count), kept = 0;
         for (size_t k = 0; k + 1 < asked; k += 2) {
             int index = bench->index[k];
             disti_ray *ray = &bench->rays[index];
             float width = ray->width, left = bench->sdf[k], right = bench->sdf[k + 1];
-            disti_keep_least(ray, disti_ray_within(ray, ray->a - width), left);
-            disti_keep_least(ray, disti_ray_within(ray, ray->a + width), right);
+            disti_keep_least(ray, disti_ray_within(ray, ray->a.s - width), left);
+            disti_keep_least(ray, disti_ray_within(ray, ray->a.s + width), right);
             float fall = left < right ? right - left : left - right;
-            if (ray->best != ray->a && !(left - 2.0f * ray->fa + right > 0.5f * fall)) {
+            if (ray->best != ray->a.s && !(left - 2.0f * ray->a.f + right > 0.5f * fall)) {
                 ray->width = 2.0f * width / DISTI_MAX(ray->fbest, 1e-30f);
                 m->fits[falling++] = index;
                 continue;
             }
-            float least = disti_parabola(width, left, ray->fa, right);
-            ray->fb = ray->fa - 0.25f * (left - right) * least / width;
-            kept = disti_minima_list(m, index, ray->a + least, kept);
+            float least = disti_parabola(width, left, ray->a.f, right);
+            ray->b.f = ray->a.f - 0.25f * (left - right) * least / width;
+            kept = disti_minima_list(m, index, ray->a.s + least, kept);
             ray->moved = DISTI_FITTED;
         }
         disti_minima_ask(m, kept);
@@ -12773,7 +12739,7 @@ static size_t disti_minima_place(disti_minima *m, const disti_corners *corners, 
     disti_ray *ray = &m->bench->rays[index];
     float t = m->bench->least_of->t[block], f = m->bench->least_of->f[block];
     if (corners->agree > 0) disti_corners_at(corners, x, y, &t, &f);
-    ray->fb = corners->agree == 4 ? f : 0.0f; /* what is to be expected; beside hits nothing is */
+    ray->b.f = corners->agree == 4 ? f : 0.0f; /* what is to be expected; beside hits nothing is */
     float s = f < 2e38f ? (float)((double)t - ray->base) : 0.0f;
     if (corners->agree == 4 && f > enough) {
         disti_keep_least(ray, s, f);
@@ -12802,7 +12768,7 @@ static void disti_minima_first(disti_minima *m)
                     continue;
                 }
                 /* the cones' samples are far apart: where the first fit helped, once more */
-                if (ray->moved == DISTI_FITTED && ray->best == ray->a) continue;
+                if (ray->moved == DISTI_FITTED && ray->best == ray->a.s) continue;
                 if (ray->fbest < DISTI_MIN(4.0f * m->far, m->plateau)) disti_minima_want_fit(m, y * w + x, 0.35f);
             }
         }
@@ -12844,8 +12810,8 @@ static void disti_minima_nodes(disti_minima *m)
         for (size_t k = 0; k < count && h < DISTI_NODE; k++) { /* f larger than foretold: the least is elsewhere */
             disti_ray *ray = &bench->rays[bench->index[k]];
             if (!(ray->fbest > m->near && ray->fbest < m->far)) continue; /* nearer ones are fitted in any case */
-            if (!(ray->fb > 0.0f)) ray->moved = DISTI_UNSURE;
-            else if (ray->fbest > 1.2f * ray->fb + 5e-4f * m->radius) disti_minima_want_fit(m, bench->index[k], 0.35f);
+            if (!(ray->b.f > 0.0f)) ray->moved = DISTI_UNSURE;
+            else if (ray->fbest > 1.2f * ray->b.f + 5e-4f * m->radius) disti_minima_want_fit(m, bench->index[k], 0.35f);
         }
         size_t fits = m->fit_count;
         m->fit_count = 0;
@@ -12901,7 +12867,7 @@ static void disti_minima_outline(disti_minima *m)
     for (int fine = 0; fine <= (m->pixel > 0.01f * m->radius); fine++) {
         for (size_t i = 0; i < m->close_count; i++) {
             const disti_ray *ray = &m->bench->rays[m->close[i]];
-            int fitted = ray->moved == DISTI_FITTED, good = fabsf(ray->fbest - ray->fb) < 0.02f * ray->fbest;
+            int fitted = ray->moved == DISTI_FITTED, good = fabsf(ray->fbest - ray->b.f) < 0.02f * ray->fbest;
             if (fine ? !fitted || good : fitted) continue;
             if (ray->fbest < m->near || disti_minima_beside_hit(m, m->close[i]))
                 disti_minima_want_fit(m, m->close[i], fine ? 0.1f : 0.35f);
@@ -12920,7 +12886,7 @@ static size_t disti_minima_push(disti_minima *m, int *front, size_t count, int i
 }
 
 /* From one pixel to the next the least |f| changes by no more than the Lipschitz figure times what they are apart
-   there; at a hit it is 0. A ray that has more than that, fb, found another minimum: it looks where its neighbor has
+   there; at a hit it is 0. A ray that has more than that, b.f, found another minimum: it looks where its neighbor has
    its own, at distance *t. */
 static int disti_minima_amiss(const disti_minima *m, int index, float *t)
 {
@@ -12935,7 +12901,7 @@ static int disti_minima_amiss(const disti_minima *m, int index, float *t)
         float at = disti_ray_distance(other[k]), f = hit ? 0.0f : fabsf(other[k]->fbest);
         float most = f + 2.1f * m->tracer->lipschitz * ray->footprint * at;
         if (!(most < least)) continue;
-        ray->fb = least = most;
+        ray->b.f = least = most;
         *t = at;
         found = 1;
     }
@@ -12954,15 +12920,15 @@ static void disti_minima_spread(disti_minima *m)
             disti_ray *ray = &m->bench->rays[front[i]];
             float t = 0.0f;
             ray->side = 0;
-            ray->fa = ray->fbest;
+            ray->a.f = ray->fbest;
             if (disti_minima_amiss(m, front[i], &t)) count = disti_minima_list_at(m, front[i], t, count);
         }
         memcpy(front, m->bench->index, count * sizeof(int));
         disti_minima_ask(m, count);
         for (size_t i = 0; i < count; i++) {
             const disti_ray *ray = &m->bench->rays[front[i]];
-            if (!(fabsf(ray->fbest) < 0.9f * fabsf(ray->fa))) continue;
-            if (ray->fbest < m->near || ray->fbest > ray->fb) disti_minima_want_fit(m, front[i], 0.35f);
+            if (!(fabsf(ray->fbest) < 0.9f * fabsf(ray->a.f))) continue;
+            if (ray->fbest < m->near || ray->fbest > ray->b.f) disti_minima_want_fit(m, front[i], 0.35f);
             front[found++] = front[i];
         }
         disti_minima_fit(m);
@@ -13018,7 +12984,7 @@ static void disti_minima_sweep(disti_minima *m)
             float t = 0.0f;
             if (ray->moved != DISTI_UNSURE) continue;
             m->close[unsure++] = index;
-            if (!disti_minima_foretell(m, index, &t, &ray->fb)) continue;
+            if (!disti_minima_foretell(m, index, &t, &ray->b.f)) continue;
             told++;
             ray->moved = DISTI_FORETOLD;
             float away = t - disti_ray_distance(ray), near = 0.1f * ray->fbest;
@@ -13029,7 +12995,7 @@ static void disti_minima_sweep(disti_minima *m)
         disti_minima_ask(m, count);
         for (size_t i = 0; i < unsure; i++) {
             disti_ray *ray = &m->bench->rays[m->close[i]];
-            int wrong = ray->fbest > 1.1f * ray->fb + 5e-4f * m->radius;
+            int wrong = ray->fbest > 1.1f * ray->b.f + 5e-4f * m->radius;
             if (told && ray->moved == DISTI_UNSURE) continue;
             if (wrong || ray->moved == DISTI_UNSURE) disti_minima_want_fit(m, m->close[i], 0.35f);
             ray->moved = 0;
@@ -13143,7 +13109,7 @@ static float disti_clamp(float f, float limit)
 }
 
 /* A step of each ray that is not done or, unless `all` are to go on, past the exit or at the surface, as many as the
-   budget has room for. ray->s: t; f: last f; a: first f of the level; fa: smallest |f| there; moved: 1 if one was not
+   budget has room for. front: t, last f; a.f: first f of the level; b.f: smallest |f| there; moved: 1 if one was not
    finite. */
 static size_t disti_paper_march(const disti_tracer *tracer, int worker, const disti_bench *bench,
                                 const disti_paper_level *level, int all)
@@ -13153,20 +13119,20 @@ static size_t disti_paper_march(const disti_tracer *tracer, int worker, const di
     for (size_t i = 0; i < level->n; i++) {
         const disti_ray *ray = &level->rays[i];
         if (ray->mode == DISTI_DONE) continue;
-        if (!all && !(ray->s < ray->leave && fabsf(ray->f) >= tracer->epsilon)) continue;
-        disti_ray_point(ray, ray->s, bench->points + 3 * count);
+        if (!all && !(ray->front.s < ray->leave && fabsf(ray->front.f) >= tracer->epsilon)) continue;
+        disti_ray_point(ray, ray->front.s, bench->points + 3 * count);
         bench->index[count++] = (int)i;
     }
     count = disti_query(tracer, worker, bench, count);
     for (size_t k = 0; k < count; k++) {
         disti_ray *ray = &level->rays[bench->index[k]];
         float f = bench->sdf[k], *samples = disti_paper_samples(tracer, level, (size_t)bench->index[k]);
-        disti_keep_least(ray, ray->s, f);
+        disti_keep_least(ray, ray->front.s, f);
         if (samples) disti_paper_keep(samples, tracer->how.samples, f, bench->points + 3 * k);
-        if (ray->steps == 0) ray->a = f;
-        if (ray->steps == 0 || fabsf(f) < ray->fa) ray->fa = fabsf(f);
-        ray->f = f;
-        if (disti_finite(f)) ray->s += alpha * disti_clamp(f, clamp);
+        if (ray->steps == 0) ray->a.f = f;
+        if (ray->steps == 0 || fabsf(f) < ray->b.f) ray->b.f = fabsf(f);
+        ray->front.f = f;
+        if (disti_finite(f)) ray->front.s += alpha * disti_clamp(f, clamp);
         else ray->moved = 1; /* and stays: a coarse ray's children go on from there */
         ray->steps++;
     }
@@ -13182,7 +13148,7 @@ static void disti_paper_inherit(const disti_tracer *tracer, const disti_paper_le
         const disti_ray *parent = &parents->rays[above];
         disti_ray *ray = &level->rays[i];
         if (ray->mode == DISTI_DONE) continue;
-        ray->s = (float)(parent->base + (double)parent->s - ray->base);
+        ray->front.s = (float)(parent->base + (double)parent->front.s - ray->base);
         ray->best = (float)(parent->base + (double)parent->best - ray->base);
         ray->fbest = parent->fbest;
         ray->steps = 0;
@@ -13210,7 +13176,7 @@ static void disti_paper_coarse(const disti_tracer *tracer, int worker, const dis
         for (int y = y0; y < DISTI_MIN(y0 + scale, tile->height); y++)
             for (int x = x0; x < DISTI_MIN(x0 + scale, tile->width); x++)
                 alive |= bench->rays[y * tile->width + x].mode != DISTI_DONE;
-        if (alive && ray->mode == DISTI_DONE) ray->s = 0.0f; /* the closest approach */
+        if (alive && ray->mode == DISTI_DONE) ray->front.s = 0.0f; /* the closest approach */
         ray->mode = alive ? DISTI_MARCH : DISTI_DONE;
     }
     disti_paper_clear(tracer, level);
@@ -13221,8 +13187,8 @@ static void disti_paper_coarse(const disti_tracer *tracer, int worker, const dis
 static void disti_paper_finish(const disti_tracer *tracer, disti_ray *ray)
 {
     float epsilon = tracer->epsilon;
-    int first = tracer->how.paper_row == DIST_PAPER_COARSE_TO_FINE || ray->a > epsilon;
-    int before = ray->s < ray->leave;
+    int first = tracer->how.paper_row == DIST_PAPER_COARSE_TO_FINE || ray->a.f > epsilon;
+    int before = ray->front.s < ray->leave;
     float f = ray->fbest, magnitude = f < 0.0f ? -f : f;
     if (ray->steps == 0) { /* without budget: its parent's sample */
         ray->q = ray->best;
@@ -13232,14 +13198,14 @@ static void disti_paper_finish(const disti_tracer *tracer, disti_ray *ray)
     ray->mode = DISTI_DONE;
     ray->status = DIST_RAY_MISS;
     if (ray->moved) ray->status = DIST_RAY_NOT_FINITE;
-    else if (before && ray->fa <= epsilon && first) ray->status = DIST_RAY_HIT;
-    else if (before && !first && ray->a < 0.0f) ray->status = DIST_RAY_INSIDE;
+    else if (before && ray->b.f <= epsilon && first) ray->status = DIST_RAY_HIT;
+    else if (before && !first && ray->a.f < 0.0f) ray->status = DIST_RAY_INSIDE;
     else if (before) ray->status = DIST_RAY_UNRESOLVED;
     /* behind the camera by more than rounding: f < 0 at first, so it went back */
     int hit = ray->status == DIST_RAY_HIT, ends = hit || ray->status == DIST_RAY_UNRESOLVED;
     int behind = ends && ray->base + (double)ray->best < -(double)tracer->noise;
     if (behind || ray->status == DIST_RAY_INSIDE) {
-        disti_ray_end(ray, DIST_RAY_INSIDE, ray->enter, ray->a, 0.0f);
+        disti_ray_end(ray, DIST_RAY_INSIDE, ray->enter, ray->a.f, 0.0f);
         return;
     }
     ray->error = before && ray->status == DIST_RAY_UNRESOLVED
@@ -13906,7 +13872,7 @@ static int disti_warm_again(disti_warm *warm, int i)
     ray->mode = DISTI_FIRST;
     ray->best = ray->q = ray->start;
     ray->fbest = 3e38f;
-    ray->fb = ray->slope = ray->error = 0.0f;
+    ray->b.f = ray->slope = ray->error = 0.0f;
     ray->steps = 0;
     ray->kept = 0;
     warm->bench->depth[i] = 0.0f;
@@ -13929,13 +13895,13 @@ static int disti_warm_resume(disti_warm *warm, int i, float s, float f)
     return 0;
 }
 
-/* The crossing of ray i lies between a and b, fa > 0 >= fb. */
-static int disti_warm_crosses(disti_warm *warm, int i, float a, float fa, float b, float fb)
+/* The crossing of ray i lies between a and b, a.f > 0 >= b.f. */
+static int disti_warm_crosses(disti_warm *warm, int i, disti_sample a, disti_sample b)
 {
     disti_ray *ray = &warm->bench->rays[i];
     warm->ask[i] = DISTI_ASK_NEAR;
     ray->moved = 0;
-    return disti_ray_open_bracket(warm->tracer, ray, a, fa, b, fb);
+    return disti_ray_open_bracket(warm->tracer, ray, a, b);
 }
 
 static void disti_warm_hit(disti_warm *warm, int i, float s, float f, float error)
@@ -13953,15 +13919,15 @@ static int disti_warm_newton(disti_warm *warm, int i, float f)
 {
     disti_ray *ray = &warm->bench->rays[i];
     float far = 0.03f * warm->tracer->field->radius, flat = disti_warm_flat(warm);
-    float epsilon = disti_ray_epsilon(warm->tracer, ray, ray->q), at = ray->q, before = ray->a, other = ray->fa;
+    const disti_sample now = {ray->q, f}, before = ray->a;
+    float epsilon = disti_ray_epsilon(warm->tracer, ray, now.s);
     int first = ray->steps++ == 0, steep;
-    float slope = first ? ray->slope : (f - ray->fa) / (ray->q - ray->a), step = -f / slope;
+    float slope = first ? ray->slope : (f - before.f) / (now.s - before.s), step = -f / slope;
     float length = step < 0.0f ? -step : step, moved = ray->q + step - warm->tape->s[disti_warm_pixel(warm, i)];
     int good = disti_finite(step) && slope < flat && length < far && moved < far && moved > -far &&
-               (first || f * f < ray->fa * ray->fa) && ray->q + step > ray->enter;
-    ray->fa = f;
+               (first || f * f < before.f * before.f) && ray->q + step > ray->enter;
+    ray->a = now;
     ray->slope = slope;
-    ray->a = ray->q;
     ray->q += step;
     steep = slope < -0.3f * warm->tracer->lipschitz;
     if (good && length <= (!first ? 12.0f : steep ? 8.0f : 4.0f) * epsilon) {
@@ -13971,11 +13937,9 @@ static int disti_warm_newton(disti_warm *warm, int i, float f)
         return 0;
     }
     if (good && ray->steps < 4) return 1;
-    if (!first && f > 0.0f && other <= 0.0f && before > at)
-        return disti_warm_crosses(warm, i, at, f, before, other);
-    if (!first && f <= 0.0f && other > 0.0f && before < at)
-        return disti_warm_crosses(warm, i, before, other, at, f);
-    return disti_warm_resume(warm, i, at, f);
+    if (!first && f > 0.0f && before.f <= 0.0f && before.s > now.s) return disti_warm_crosses(warm, i, now, before);
+    if (!first && f <= 0.0f && before.f > 0.0f && before.s < now.s) return disti_warm_crosses(warm, i, before, now);
+    return disti_warm_resume(warm, i, now.s, f);
 }
 
 /* Where f changes alike, hits move by that over their slopes: how much more i moves than k. Else (`slopes` 0) alike. */
@@ -14130,79 +14094,80 @@ static int disti_warm_minima_due(const disti_warm *warm, float change)
 /* Whether a hit that a nearer surface may cover has come down to what it is itself, which is known. */
 static int disti_warm_own(const disti_ray *ray)
 {
-    return ray->moved && ray->status == DIST_RAY_HIT && ray->s + ray->width >= ray->best;
+    return ray->moved && ray->status == DIST_RAY_HIT && ray->front.s + ray->width >= ray->best;
 }
 
-/* One sample f at ray->q of a ray that passes close by a surface; ray->s, f: the lowest one so far. Samples on both
+/* One sample f at ray->q of a ray that passes close by a surface; ray->front: the lowest one so far. Samples on both
    sides, in strides that double (downhill the one behind is known: it was where the last began), until both are higher,
    and then in narrower ones around where the parabola through the three is lowest, until it is known how low that is.
-   ray->side: 0 the first of two, 1 the second, 2 where the parabola is lowest, 3 the only one, before ray->fb.
+   ray->side: 0 the first of two, 1 the second, 2 where the parabola is lowest, 3 the only one, before ray->b.
    Returns 0: it is more than `least`, or the ray's own hit; below 0: the crossing is bracketed. 1: another query; -1:
    undecided. */
 static int disti_warm_pass(const disti_warm *warm, disti_ray *ray, float f, float least)
 {
     ray->steps++;
     if (f <= 0.0f) { /* back to a positive sample and into the bracket */
-        ray->b = ray->q;
-        ray->fb = f;
+        ray->b.s = ray->q;
+        ray->b.f = f;
         ray->width = DISTI_MAX(1.5f * -f / warm->tracer->lipschitz, 0.25f * ray->width);
         return disti_ray_ask(ray, DISTI_BACK, DISTI_MAX(ray->q - ray->width, ray->enter));
     }
     if (ray->side == 0 || ray->side == 3) { /* the other side */
         int known = ray->side == 3;
         ray->side = 1;
-        ray->fa = f;
-        if (!known) return disti_ray_ask(ray, DISTI_WAIT, DISTI_MIN(ray->s + ray->width, ray->leave));
-        f = ray->fb;
+        ray->a.f = f;
+        if (!known) return disti_ray_ask(ray, DISTI_WAIT, DISTI_MIN(ray->front.s + ray->width, ray->leave));
+        f = ray->b.f;
     }
-    if (ray->side == 1 && ray->fa >= ray->f && f >= ray->f) {
-        float curvature = ray->fa - 2.0f * ray->f + f, rise = DISTI_MAX(ray->fa, f) - ray->f;
-        float drop = curvature > 0.0f ? (ray->fa - f) * (ray->fa - f) / (8.0f * curvature) : 0.0f;
-        float q = ray->s + disti_parabola(ray->width, ray->fa, ray->f, f);
+    if (ray->side == 1 && ray->a.f >= ray->front.f && f >= ray->front.f) {
+        float curvature = ray->a.f - 2.0f * ray->front.f + f, rise = DISTI_MAX(ray->a.f, f) - ray->front.f;
+        float drop = curvature > 0.0f ? (ray->a.f - f) * (ray->a.f - f) / (8.0f * curvature) : 0.0f;
+        float q = ray->front.s + disti_parabola(ray->width, ray->a.f, ray->front.f, f);
         q = DISTI_MIN(DISTI_MAX(q, ray->enter), ray->leave);
-        int convex = ray->f - rise > DISTI_MAX(0.5f * ray->f, 2.0f * warm->tracer->noise); /* above its chords, too */
-        if (convex || ray->f - drop - 0.25f * rise > DISTI_MAX(least, ray->moved ? 0.0f : 0.5f * ray->f)) {
-            ray->s = q;
-            ray->f -= drop;
+        /* above its chords, too */
+        int convex = ray->front.f - rise > DISTI_MAX(0.5f * ray->front.f, 2.0f * warm->tracer->noise);
+        if (convex || ray->front.f - drop - 0.25f * rise > DISTI_MAX(least, ray->moved ? 0.0f : 0.5f * ray->front.f)) {
+            ray->front.s = q;
+            ray->front.f -= drop;
             return 0;
         }
         ray->side = 2;
         return disti_ray_ask(ray, DISTI_WAIT, q);
     }
     if (ray->side == 2) {
-        if (f < ray->f) ray->s = ray->q;
-        ray->f = DISTI_MIN(ray->f, f);
+        if (f < ray->front.f) ray->front.s = ray->q;
+        ray->front.f = DISTI_MIN(ray->front.f, f);
         ray->width *= 0.25f;
-        if (ray->width < 0.25f * least) return ray->f > least ? 0 : -1;
+        if (ray->width < 0.25f * least) return ray->front.f > least ? 0 : -1;
         ray->side = 0;
     } else {
-        int back = ray->fa < f;
-        ray->s += back ? -ray->width : ray->width;
-        ray->f = back ? ray->fa : f;
-        ray->fb = f;
+        int back = ray->a.f < f;
+        ray->front.s += back ? -ray->width : ray->width;
+        ray->front.f = back ? ray->a.f : f;
+        ray->b.f = f;
         ray->width *= 2.0f;
         ray->side = back ? 3 : 1;
     }
-    if (ray->steps > 24 || ray->s <= ray->enter || ray->s >= ray->leave) return -1;
+    if (ray->steps > 24 || ray->front.s <= ray->enter || ray->front.s >= ray->leave) return -1;
     if (ray->side == 1) {
         if (disti_warm_own(ray)) return 0;
-        return disti_ray_ask(ray, DISTI_WAIT, DISTI_MIN(ray->s + ray->width, ray->leave));
+        return disti_ray_ask(ray, DISTI_WAIT, DISTI_MIN(ray->front.s + ray->width, ray->leave));
     }
-    return disti_ray_ask(ray, DISTI_WAIT, DISTI_MAX(ray->s - ray->width, ray->enter));
+    return disti_ray_ask(ray, DISTI_WAIT, DISTI_MAX(ray->front.s - ray->width, ray->enter));
 }
 
-/* Ray i passes close by a surface or runs into it: from ray->s, f on, first to where spheres of as much room on both
+/* Ray i passes close by a surface or runs into it: from ray->front on, first to where spheres of as much room on both
    sides touch that of f. With ray->moved it has another end already, which stands if it passes. */
 static int disti_warm_approach(disti_warm *warm, int i)
 {
     disti_ray *ray = &warm->bench->rays[i];
     warm->ask[i] = DISTI_ASK_NEAR;
-    ray->width = DISTI_MAX(2.0f * ray->f, 2e-3f * warm->tracer->field->radius);
+    ray->width = DISTI_MAX(2.0f * ray->front.f, 2e-3f * warm->tracer->field->radius);
     ray->side = 0;
     ray->steps = 0;
-    ray->q = ray->s;
-    return ray->f <= 0.0f ? disti_warm_pass(warm, ray, ray->f, 0.0f)
-                          : disti_ray_ask(ray, DISTI_WAIT, DISTI_MAX(ray->s - ray->width, ray->enter));
+    ray->q = ray->front.s;
+    return ray->front.f <= 0.0f ? disti_warm_pass(warm, ray, ray->front.f, 0.0f)
+                          : disti_ray_ask(ray, DISTI_WAIT, DISTI_MAX(ray->front.s - ray->width, ray->enter));
 }
 
 /* Whether the tape's miss of ray i still stands if f was positive where it is least: no cone says otherwise. */
@@ -14342,7 +14307,7 @@ static int disti_warm_beside(disti_warm *warm, int i, int fresh)
     if (!(hit || miss) || !(turn || (hit && warm->calm == 1))) return 0;
     if (!warm->open[i] || ray->mode != DISTI_DONE || s <= ray->start || s >= ray->leave) return 0;
     ray->q = s;
-    ray->f = 3e38f;
+    ray->front.f = 3e38f;
     ray->moved = 1;
     ray->steps = 0;
     warm->ask[i] = DISTI_ASK_BESIDE;
@@ -14362,8 +14327,8 @@ static int disti_warm_least(disti_warm *warm, int i, float f)
                 (same || (odd && f > 3.0f * epsilon));
     if (!warm->silhouette && value > 0.0f) warm->drift[i] = f - value;
     if (!(warm->silhouette && value > 0.0f)) margin += 0.03f * radius; /* the bound is used up: a new one */
-    ray->f = f;
-    ray->s = ray->best;
+    ray->front.f = f;
+    ray->front.s = ray->best;
     if (!(f > margin) && !still) return disti_warm_approach(warm, i);
     disti_ray_end(ray, DIST_RAY_MISS, ray->best, warm->silhouette || !(f > margin) ? f : 0.5f * f, 0.0f);
     ray->kept = !(f > margin && warm->due);
@@ -14375,11 +14340,11 @@ static int disti_warm_sphere(disti_warm *warm, int i, float f)
 {
     disti_ray *ray = &warm->bench->rays[i];
     int hit = ray->status == DIST_RAY_HIT, more;
-    float epsilon = disti_ray_epsilon(warm->tracer, ray, ray->q), before = ray->f;
+    float epsilon = disti_ray_epsilon(warm->tracer, ray, ray->q), before = ray->front.f;
     float *bound = &warm->tape->beside[disti_warm_pixel(warm, i)];
     float away = hit ? 0.5f * warm->change + 2.0f * epsilon : 0.03f * warm->tracer->field->radius;
-    ray->f = f;
-    ray->s = ray->q;
+    ray->front.f = f;
+    ray->front.s = ray->q;
     if (!(f > away) || ray->steps++ > 7) {
         *bound = DISTI_MAX(0.5f * f, 0.0f); /* if it meets no other */
         return disti_warm_approach(warm, i);
@@ -14394,7 +14359,7 @@ static int disti_warm_sphere(disti_warm *warm, int i, float f)
 static int disti_warm_near(disti_warm *warm, int i, float f)
 {
     disti_ray *ray = &warm->bench->rays[i];
-    float least = 2.0f * disti_ray_epsilon(warm->tracer, ray, ray->s) + 0.1f * warm->change;
+    float least = 2.0f * disti_ray_epsilon(warm->tracer, ray, ray->front.s) + 0.1f * warm->change;
     float *bound = &warm->tape->beside[disti_warm_pixel(warm, i)];
     int more = ray->mode == DISTI_WAIT ? disti_warm_pass(warm, ray, f, least) : disti_ray_advance(warm->tracer, ray, f);
     if (more > 0) return 1;
@@ -14406,12 +14371,12 @@ static int disti_warm_near(disti_warm *warm, int i, float f)
         warm->moved[i] = 3e38f;
         warm->bench->depth[i] = disti_hit_depth(ray);
     } else if (ray->moved) {
-        float off = ray->s - ray->best, other = 0.01f * warm->tracer->field->radius;
+        float off = ray->front.s - ray->best, other = 0.01f * warm->tracer->field->radius;
         int same = ray->status == DIST_RAY_MISS && off < ray->width && -off < ray->width;
         ray->mode = DISTI_DONE; /* a miss that came down to its least, which has a bound of its own, met no other */
-        if (!disti_warm_own(ray)) *bound = same ? DISTI_MAX(ray->f, other) : ray->f;
+        if (!disti_warm_own(ray)) *bound = same ? DISTI_MAX(ray->front.f, other) : ray->front.f;
     } else {
-        disti_ray_end(ray, DIST_RAY_MISS, ray->s, ray->f, 0.0f);
+        disti_ray_end(ray, DIST_RAY_MISS, ray->front.s, ray->front.f, 0.0f);
         return disti_warm_beside(warm, i, 0);
     }
     return 0;
@@ -14423,11 +14388,11 @@ static int disti_warm_arrives(const disti_warm *warm, int i)
 {
     size_t pixel = disti_warm_pixel(warm, i);
     const disti_ray *ray = &warm->bench->rays[i];
-    float left = warm->tape->s[pixel] - ray->s, slope = warm->tape->value[pixel];
+    float left = warm->tape->s[pixel] - ray->front.s, slope = warm->tape->value[pixel];
     if (warm->ask[i] != DISTI_ASK_REFRESH || warm->moved[i] < 2e38f) return 0;
     if ((warm->tape->status[pixel] & 15) != DIST_RAY_HIT || !disti_warm_falls(warm, pixel)) return 0;
     if (ray->mode != DISTI_MARCH && ray->mode != DISTI_JUMP) return 0;
-    return left > 0.0f && left < disti_warm_far(warm) && ray->f + warm->change >= -0.7f * slope * left;
+    return left > 0.0f && left < disti_warm_far(warm) && ray->front.f + warm->change >= -0.7f * slope * left;
 }
 
 static void disti_warm_drifted(disti_warm *warm, int i, float f)
@@ -14495,7 +14460,7 @@ static void disti_warm_rounds(disti_warm *warm, int all)
             const disti_ray *ray = &bench->rays[bench->index[k]];
             disti_ray_point(ray, ray->q, bench->points + 3 * points++);
             if (pairs && disti_warm_both(warm, bench->index[k]))
-                disti_ray_point(ray, DISTI_MIN(ray->s + ray->width, ray->leave), bench->points + 3 * points++);
+                disti_ray_point(ray, DISTI_MIN(ray->front.s + ray->width, ray->leave), bench->points + 3 * points++);
         }
         size_t asked = disti_query(warm->tracer, warm->worker, bench, points);
         for (size_t k = 0; k < count; k++) {

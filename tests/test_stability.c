@@ -1350,7 +1350,8 @@ TEST(row_33_secant_with_equal_ends)
     dist_field field = shape_field(&stairs, 1, 1);
     CHECK_STATUS(DIST_OK, disti_tracer_init(&tracer, ctx, &field, NULL, "test"), ctx);
     memset(&ray, 0, sizeof ray);
-    for (int i = disti_ray_open_bracket(&tracer, &ray, 0.1f, 0, 0.2f, 0); i; i = disti_ray_advance(&tracer, &ray, 0)) {}
+    const disti_sample from = {0.1f, 0}, to = {0.2f, 0};
+    for (int i = disti_ray_open_bracket(&tracer, &ray, from, to); i; i = disti_ray_advance(&tracer, &ray, 0)) {}
     SAY(ray.best >= 0.1f && ray.best <= 0.2f && ray.status == DIST_RAY_HIT, "bracket of zeros: s", "0.1 to 0.2",
         ray.best);
     dist_context_destroy(ctx);

@@ -1766,6 +1766,12 @@ TEST(certified_pictures_of_nets_miss_nothing)
     dist_context_destroy(ctx);
 }
 
+static disti_sample sample(float s, float f)
+{
+    disti_sample made = {s, f};
+    return made;
+}
+
 /* What rays of decoders met: f came down at a slope that foretold a crossing half way to where it crossed again; kept a
    height of 0.7 epsilon for 17 times as far as its slope said; and crossed 0 at .23 of a coarse bracket, not at .1. */
 TEST(bounds_reach_to_where_f_was_foretold_to_cross_and_over_what_is_flat)
@@ -1783,32 +1789,33 @@ TEST(bounds_reach_to_where_f_was_foretold_to_cross_and_over_what_is_flat)
         ray.sign = 1;
         ray.known = 1;
         ray.slope = -0.4373f;
-        CHECK(disti_ray_open_bracket(&tracer, &ray, 0, 5.211e-3f, 2.34e-2f, -5e-7f));
-        CHECK_EQUAL(0, disti_ray_bracketed(&tracer, &ray, -1.3e-6f));
+        CHECK(disti_ray_open_bracket(&tracer, &ray, sample(0, 5.211e-3f), sample(2.34e-2f, -5e-7f)));
+        CHECK_EQUAL(0, disti_ray_bracketed(&tracer, &ray, sample(ray.q, -1.3e-6f)));
         CHECK_EQUAL(DIST_RAY_HIT, ray.status);
         CHECK(ray.error > (certified ? 1.8e-2f : 9.3e-3f)); /* was 2e-5; so much of it is not proven to be empty */
     }
     tracer.how.certified = 1;
-    CHECK(disti_ray_open_bracket(&tracer, &ray, 0, 5.211e-3f, 5.2115e-3f, -5e-7f)); /* but this is */
-    CHECK_EQUAL(0, disti_ray_bracketed(&tracer, &ray, 5.211e-3f - ray.q));
+    CHECK(disti_ray_open_bracket(&tracer, &ray, sample(0, 5.211e-3f), sample(5.2115e-3f, -5e-7f))); /* but this is */
+    CHECK_EQUAL(0, disti_ray_bracketed(&tracer, &ray, sample(ray.q, 5.211e-3f - ray.q)));
     CHECK(ray.error < 1e-5f);
-    CHECK_EQUAL(0, disti_ray_open_bracket(&tracer, &ray, 0, 3e-5f, 9e-5f, -3e-5f)); /* as short as two epsilons */
+    /* as short as two epsilons */
+    CHECK_EQUAL(0, disti_ray_open_bracket(&tracer, &ray, sample(0, 3e-5f), sample(9e-5f, -3e-5f)));
     CHECK_EQUAL(DIST_RAY_HIT, ray.status);
     CHECK_NEAR(4.5e-5, ray.best, 1e-9);
     CHECK_NEAR(9e-5, ray.error, 1e-9);
-    CHECK(disti_ray_alone(&tracer, &ray, 0, 0.1f, 0.5f, -0.5f, 0));
+    CHECK(disti_ray_alone(&tracer, &ray, sample(0, 0.1f), sample(0.5f, -0.5f), 0));
     tracer.far = 0.1f; /* twice as steep where |f| is larger: 0.5 is at least 0.3 deep, not 0.5 */
     tracer.ratio = 0.5f;
-    CHECK(!disti_ray_alone(&tracer, &ray, 0, 0.1f, 0.5f, -0.5f, 0));
+    CHECK(!disti_ray_alone(&tracer, &ray, sample(0, 0.1f), sample(0.5f, -0.5f), 0));
     CHECK_STATUS(DIST_OK, disti_tracer_init(&tracer, ctx, &field, NULL, "test"), ctx);
     memset(&ray, 0, sizeof ray);
     ray.sign = 1;
     ray.base = 2;
     ray.leave = 0.5f;
-    ray.fa = 3e38f;
+    ray.a.f = 3e38f;
     ray.incline = -0.4686f;
     ray.width = 4;
-    CHECK_EQUAL(0, disti_ray_predicted(&tracer, &ray, 3.572e-5f));
+    CHECK_EQUAL(0, disti_ray_predicted(&tracer, &ray, sample(ray.q, 3.572e-5f)));
     CHECK_EQUAL(DIST_RAY_HIT, ray.status);
     CHECK(ray.error > 1.28e-3f && ray.error < 2e-3f);
     dist_render_desc how = plain_how();
@@ -1817,7 +1824,7 @@ TEST(bounds_reach_to_where_f_was_foretold_to_cross_and_over_what_is_flat)
     memset(&ray, 0, sizeof ray);
     ray.sign = 1;
     ray.slope = -1;
-    CHECK_EQUAL(0, disti_ray_open_bracket(&tracer, &ray, 0, 4e-4f, 4e-3f, -3.6e-3f));
+    CHECK_EQUAL(0, disti_ray_open_bracket(&tracer, &ray, sample(0, 4e-4f), sample(4e-3f, -3.6e-3f)));
     CHECK_EQUAL(DIST_RAY_HIT, ray.status);
     CHECK(ray.error > 1.1e-3f && ray.error < 2.1e-3f); /* was 8e-4 */
     dist_context_destroy(ctx);
@@ -1880,25 +1887,25 @@ TEST(steps_that_may_have_gone_through_something_are_taken_back)
     ray.base = 2;
     ray.known = 1;
     ray.mode = DISTI_JUMP;
-    ray.s = 0.25487f;
-    ray.f = 3.8564e-2f;
+    ray.front.s = 0.25487f;
+    ray.front.f = 3.8564e-2f;
     ray.slope = -0.2855f;
     CHECK(!disti_ray_trusts(&tracer, &ray, 3.4974e-5f, 0.108897f));
     CHECK(disti_ray_trusts(&tracer, &ray, 3.7e-3f, 0.108897f));
-    ray.a = 0.341199f;
-    ray.fa = 2.388e-2f;
-    ray.s = 0.404929f;
-    ray.f = 1.0003e-2f;
+    ray.a.s = 0.341199f;
+    ray.a.f = 2.388e-2f;
+    ray.front.s = 0.404929f;
+    ray.front.f = 1.0003e-2f;
     ray.slope = -0.2178f;
     ray.q = 0.431654f;
-    CHECK(disti_ray_doubts(&tracer, &ray, 2.4429e-2f, ray.q - ray.s));
-    CHECK(!disti_ray_doubts(&tracer, &ray, 1.2e-2f, ray.q - ray.s)); /* so gently, f was above 0 all the way */
+    CHECK(disti_ray_doubts(&tracer, &ray, 2.4429e-2f, ray.q - ray.front.s));
+    CHECK(!disti_ray_doubts(&tracer, &ray, 1.2e-2f, ray.q - ray.front.s)); /* so gently, f was above 0 all the way */
     CHECK_EQUAL(1, disti_ray_advance(&tracer, &ray, 2.4429e-2f));
-    CHECK_NEAR(0.341199, ray.s, 1e-6);
-    CHECK_NEAR(0.404929, ray.b, 1e-6);
-    CHECK(ray.q > ray.s && ray.q < ray.b && ray.mode == DISTI_MARCH);
+    CHECK_NEAR(0.341199, ray.front.s, 1e-6);
+    CHECK_NEAR(0.404929, ray.b.s, 1e-6);
+    CHECK(ray.q > ray.front.s && ray.q < ray.b.s && ray.mode == DISTI_MARCH);
     tracer.how.certified = 1;
-    ray.fa = 2.388e-2f;
+    ray.a.f = 2.388e-2f;
     CHECK(!disti_ray_doubts(&tracer, &ray, 2.4429e-2f, 0.0267f)); /* nothing was trusted there */
     tracer.how.certified = 0;
     memset(&ray, 0, sizeof ray);
@@ -1908,11 +1915,11 @@ TEST(steps_that_may_have_gone_through_something_are_taken_back)
     ray.best = 8.1e-3f;
     ray.fbest = 2.3094e-4f;
     ray.mode = DISTI_JUMP;
-    CHECK_EQUAL(1, disti_ray_open_bracket(&tracer, &ray, 0, 8.2277e-3f, 3.03e-2f, -7.0323e-3f));
-    CHECK(ray.a > 8e-3f && ray.fa < 2.4e-4f && ray.target > 2e-2f);
+    CHECK_EQUAL(1, disti_ray_open_bracket(&tracer, &ray, sample(0, 8.2277e-3f), sample(3.03e-2f, -7.0323e-3f)));
+    CHECK(ray.a.s > 8e-3f && ray.a.f < 2.4e-4f && ray.target > 2e-2f);
     ray.mode = DISTI_BACK; /* warm start: best is of another picture */
-    CHECK_EQUAL(1, disti_ray_open_bracket(&tracer, &ray, 0, 8.2277e-3f, 3.03e-2f, -7.0323e-3f));
-    CHECK_NEAR(0, ray.a, 0);
+    CHECK_EQUAL(1, disti_ray_open_bracket(&tracer, &ray, sample(0, 8.2277e-3f), sample(3.03e-2f, -7.0323e-3f)));
+    CHECK_NEAR(0, ray.a.s, 0);
     for (int skips = 0; skips < 2; skips++) { /* along ripples of f, or past spheres to f = 0: from there on, or... */
         memset(&ray, 0, sizeof ray);
         ray.sign = ray.leave = 1;
@@ -1920,25 +1927,25 @@ TEST(steps_that_may_have_gone_through_something_are_taken_back)
         ray.mode = skips ? DISTI_SKIP : DISTI_MARCH;
         ray.base = 2;
         ray.footprint = 1e-3f;
-        ray.s = 0.1739f;
-        ray.f = 1.652e-4f;
+        ray.front.s = 0.1739f;
+        ray.front.f = 1.652e-4f;
         ray.slope = -0.087f;
         ray.q = skips ? 0.18f : 0.1756f;
         CHECK_EQUAL(1, disti_ray_advance(&tracer, &ray, skips ? 4e-6f : 1.82e-5f));
-        CHECK_NEAR(0.1739, ray.crept, 1e-6);
-        ray.a = 0.1759f;
-        ray.b = 0.176f;
-        ray.fa = 1e-5f;
-        ray.fb = -2e-5f;
+        CHECK_NEAR(0.1739, ray.crept.s, 1e-6);
+        ray.a.s = 0.1759f;
+        ray.b.s = 0.176f;
+        ray.a.f = 1e-5f;
+        ray.b.f = -2e-5f;
         ray.incline = -0.3f;
         ray.target = 0;
         CHECK_NEAR(0.176 - 0.1739, disti_ray_kink(&tracer, &ray, 0.35f), 1e-6);
         CHECK(disti_ray_kink(&tracer, &ray, 0.15f) < 1e-4f); /* but not where f falls as it did all the way, */
-        disti_ray_creeps(&tracer, &ray, 6e-4f, 0);
+        disti_ray_creeps(&tracer, &ray, sample(ray.q, 6e-4f), 0);
         CHECK(disti_ray_kink(&tracer, &ray, 0.35f) < 1e-4f); /* or has been well above 0 since */
         tracer.how.certified = 1;
-        disti_ray_creeps(&tracer, &ray, 1e-5f, 1);
-        CHECK(!(ray.fcrept > 0)); /* nothing was trusted */
+        disti_ray_creeps(&tracer, &ray, sample(ray.q, 1e-5f), 1);
+        CHECK(!(ray.crept.f > 0)); /* nothing was trusted */
         tracer.how.certified = 0;
     }
     for (int coarse = 0; coarse < 2; coarse++) { /* foretold was f = 0; hardly less than at the front, it is flat */
@@ -1949,12 +1956,12 @@ TEST(steps_that_may_have_gone_through_something_are_taken_back)
             ray.sign = 1;
             ray.base = 2;
             ray.leave = 0.5f;
-            ray.f = fell ? 5.4e-2f : 5.54e-4f;
-            ray.fa = 3e38f;
+            ray.front.f = fell ? 5.4e-2f : 5.54e-4f;
+            ray.a.f = 3e38f;
             ray.q = 9.4e-4f;
             ray.incline = -0.889f;
             ray.width = 4;
-            CHECK_EQUAL(fell ? 0 : 1, disti_ray_predicted(&tracer, &ray, 5.39e-4f));
+            CHECK_EQUAL(fell ? 0 : 1, disti_ray_predicted(&tracer, &ray, sample(ray.q, 5.39e-4f)));
             CHECK(fell || (ray.mode != DISTI_PREDICT && ray.mode != DISTI_DONE));
             CHECK(!fell || (ray.error >= 0.75f * how.epsilon && ray.error < how.epsilon + 5e-3f)); /* of one sample */
         }
@@ -2014,11 +2021,11 @@ TEST(flat_rays_end_at_samples_within_epsilon)
         ray.sign = 1;
         ray.base = 2;
         ray.leave = 0.5f;
-        ray.f = 0.01f;
-        ray.s = -0.02f;
-        ray.a = -3e-3f;
-        ray.fa = sign * f - 3e-3f * slope; /* the slope of the last two samples */
-        CHECK_EQUAL(k == 3 ? 1 : 0, disti_ray_predicted(&tracer, &ray, sign * f));
+        ray.front.f = 0.01f;
+        ray.front.s = -0.02f;
+        ray.a.s = -3e-3f;
+        ray.a.f = sign * f - 3e-3f * slope; /* the slope of the last two samples */
+        CHECK_EQUAL(k == 3 ? 1 : 0, disti_ray_predicted(&tracer, &ray, sample(ray.q, sign * f)));
         CHECK(k == 3 || ray.status == DIST_RAY_HIT);
     }
     dist_context_destroy(ctx);

@@ -11898,7 +11898,7 @@ static void disti_ray_skip(disti_ray *ray)
     ray->status = DIST_RAY_SKIPPED; /* mode is DISTI_DONE, and the sphere is not met: enter = leave */
 }
 
-/* A ray that misses, and of which no more is wanted: it is not even made. */
+/* A ray that misses; where no more is wanted of it, it is not even made. */
 static void disti_ray_close(disti_ray *ray)
 {
     ray->mode = DISTI_DONE;
@@ -12069,8 +12069,7 @@ static void disti_cone_finish(const disti_tracer *tracer, const disti_tile *tile
             disti_ray *ray = &bench->rays[y * tile->width + x];
             if (ray->mode != DISTI_FIRST && ray->mode != DISTI_WAIT) continue;
             if (cone->state == DISTI_CONE_THROUGH || cone->t >= ray->base + (double)ray->leave) {
-                ray->mode = DISTI_DONE;
-                ray->status = DIST_RAY_MISS;
+                disti_ray_close(ray);
                 continue;
             }
             ray->start = ray->q = DISTI_MAX(ray->enter, (float)(cone->t - ray->base));
@@ -12082,10 +12081,10 @@ static void disti_cone_finish(const disti_tracer *tracer, const disti_tile *tile
 }
 
 /* Adds a block's cone to those in bench->rest, and to the list where it marches. */
-static void disti_cone_add(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench, int x, int y,
-                           int size, const disti_cone *parent, int *count, size_t *listed)
+static void disti_cone_add(const disti_tracer *tracer, const disti_tile *tile, disti_bench *bench, int x, int y,
+                           int size, const disti_cone *parent, size_t *listed)
 {
-    disti_cone *cone = (disti_cone *)(void *)bench->rest + *count;
+    disti_cone *cone = (disti_cone *)(void *)bench->rest + bench->cones;
     memset(cone, 0, sizeof *cone);
     cone->x = x;
     cone->y = y;
@@ -12095,27 +12094,27 @@ static void disti_cone_add(const disti_tracer *tracer, const disti_tile *tile, c
     cone->least_t = parent ? parent->least_t : 0.0;
     cone->least_f = parent ? parent->least_f : 3e38f;
     disti_cone_init(tracer, tile, bench, cone);
-    if (cone->state == DISTI_CONE_MARCHES) bench->index[(*listed)++] = *count;
-    (*count)++;
+    if (cone->state == DISTI_CONE_MARCHES) bench->index[(*listed)++] = bench->cones;
+    bench->cones++;
 }
 
 /* Adds the cones of a block's four quarters. */
-static void disti_cone_split(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench,
-                             disti_cone *cone, int *count, size_t *listed)
+static void disti_cone_split(const disti_tracer *tracer, const disti_tile *tile, disti_bench *bench, disti_cone *cone,
+                             size_t *listed)
 {
     int half = cone->size / 2;
     cone->state = DISTI_CONE_SPLIT;
     for (int k = 0; k < 4; k++) {
         int x = cone->x + (k & 1 ? half : 0), y = cone->y + (k & 2 ? half : 0);
         if (x < tile->own_width && y < tile->own_height)
-            disti_cone_add(tracer, tile, bench, x, y, half, cone, count, listed);
+            disti_cone_add(tracer, tile, bench, x, y, half, cone, listed);
     }
 }
 
 /* Marches the `active` cones listed in bench->index, and the parts that they fall into down to `leaf` pixels, all that
    are on their way in packed rounds. tile: that of cones whose `tile` is 0, and those that follow. */
-static void disti_cone_rounds(const disti_tracer *tracer, int worker, const disti_tile *tile, const disti_bench *bench,
-                              int *count, size_t active, int leaf)
+static void disti_cone_rounds(const disti_tracer *tracer, int worker, const disti_tile *tile, disti_bench *bench,
+                              size_t active, int leaf)
 {
     disti_cone *cones = (disti_cone *)(void *)bench->rest;
     while (active > 0) {
@@ -12127,7 +12126,7 @@ static void disti_cone_rounds(const disti_tracer *tracer, int worker, const dist
             cone->state = i < asked ? disti_cone_advance(tracer, cone, bench->sdf[i]) : DISTI_CONE_BLOCKED;
             if (cone->state == DISTI_CONE_MARCHES) bench->index[kept++] = bench->index[i];
             if (cone->state == DISTI_CONE_BLOCKED && i < asked && cone->size > leaf)
-                disti_cone_split(tracer, tile + cone->tile, bench, cone, count, &all);
+                disti_cone_split(tracer, tile + cone->tile, bench, cone, &all);
         }
         memmove(bench->index + kept, bench->index + active, (all - active) * sizeof(int));
         active = kept + all - active;
@@ -12141,7 +12140,7 @@ static void disti_cones_first(const disti_tracer *tracer, const disti_tile *tile
     while (first > leaf && first / 2 >= DISTI_MAX(tile->own_width, tile->own_height)) first /= 2;
     for (int y = 0; y < tile->own_height; y += first)
         for (int x = 0; x < tile->own_width; x += first)
-            disti_cone_add(tracer, tile, bench, x, y, first, NULL, &bench->cones, listed);
+            disti_cone_add(tracer, tile, bench, x, y, first, NULL, listed);
 }
 
 /* Blocks of 32, 16, 8 and so on to `leaf` pixels. Returns how many are not seen to be empty. known: those that did
@@ -12150,16 +12149,16 @@ static int disti_cones(const disti_tracer *tracer, int worker, const disti_tile 
                        const disti_cone *known)
 {
     disti_cone *cones = (disti_cone *)(void *)bench->rest;
-    const disti_cone *cone = cones;
     size_t active = 0;
     int blocked = 0;
     DIST_ASSERT((size_t)DISTI_CONES_MOST * sizeof(disti_cone) <= (size_t)DISTI_REST_BYTES);
     if (!known) disti_cones_first(tracer, tile, bench, (int)DISTI_CONE_FIRST, leaf, &active);
     for (; known && known->size > 0; known++) cones[bench->cones++] = *known;
-    disti_cone_rounds(tracer, worker, tile, bench, &bench->cones, active, leaf);
-    for (int i = 0; i < bench->cones; i++) blocked += cone[i].state == DISTI_CONE_BLOCKED;
+    disti_cone_rounds(tracer, worker, tile, bench, active, leaf);
+    for (int i = 0; i < bench->cones; i++) blocked += cones[i].state == DISTI_CONE_BLOCKED;
     if (tile->lazy && blocked == 0) return 0;
-    for (int i = 0; i < bench->cones; i++, cone++) {
+    for (int i = 0; i < bench->cones; i++) {
+        const disti_cone *cone = &cones[i];
         int x1 = disti_block_end(cone->x, cone->size, tile->own_width, tile->width);
         int y1 = disti_block_end(cone->y, cone->size, tile->own_height, tile->height);
         if (cone->state == DISTI_CONE_SPLIT) continue;
@@ -12339,9 +12338,9 @@ static void disti_outline(const disti_tracer *tracer, int worker, const disti_ti
             int x = cones[i].x + (k & 1 ? tile->lattice : 0), y = cones[i].y + (k & 2 ? tile->lattice : 0);
             open |= x < tile->width && y < tile->height && bench->rays[y * tile->width + x].status != DIST_RAY_HIT;
         }
-        if (open) disti_cone_split(tracer, tile, bench, &cones[i], &bench->cones, &active);
+        if (open) disti_cone_split(tracer, tile, bench, &cones[i], &active);
     }
-    disti_cone_rounds(tracer, worker, tile, bench, &bench->cones, active, DISTI_CONE_OUTLINE);
+    disti_cone_rounds(tracer, worker, tile, bench, active, DISTI_CONE_OUTLINE);
     for (int i = first; i < bench->cones; i++)
         if (cones[i].state != DISTI_CONE_SPLIT) disti_cone_finish(tracer, tile, bench, &cones[i]);
 }
@@ -14716,7 +14715,7 @@ static void disti_cones_task(void *arg, int index, int worker)
         for (int k = before; k < bench.cones; k++) cones[k].tile = i;
         to[i] = job->tape->cones + (size_t)(first + i) * each;
     }
-    disti_cone_rounds(job->tracer, worker, tiles, &bench, &bench.cones, active, leaf);
+    disti_cone_rounds(job->tracer, worker, tiles, &bench, active, leaf);
     for (int k = 0; k < bench.cones; k++)
         if (cones[k].state != DISTI_CONE_SPLIT) *to[cones[k].tile]++ = cones[k];
     for (int i = 0; i < count; i++) to[i]->size = 0;

@@ -11172,6 +11172,9 @@ typedef struct disti_foot {
     unsigned char pulled; /* the last move was a pull */
     unsigned char settled; /* no way along the surface leads nearer to p */
     unsigned char looks, found, waits; /* looks so far; the last one found something; the sample is another foot's */
+    unsigned char doubt;  /* of a scene: DISTI_DOUBT_* */
+    int first;            /* the leaf whose sphere is nearest; clear: how near that is, then what was not gone to */
+    float clear;
 } disti_foot;
 
 enum { DISTI_FEET = 512, DISTI_FOOT_STEPS = 160, DISTI_FOOT_TURN = 48, DISTI_FOOT_SLIDES = 16, DISTI_FOOT_LOOKS = 5,
@@ -11552,6 +11555,8 @@ static int disti_foot_begin(const dist_field *field, const float *p, float radiu
     foot->radius = radius;
     foot->damping = foot->relax = foot->sign = 1.0f;
     foot->share = 0.5f;
+    foot->first = -1;
+    foot->clear = 3e38f;
     foot->status = DIST_RAY_NOT_FINITE;
     if (!disti_finite_all(3, p) || !disti_finite(radius)) return 0;
     foot->away = disti_foot_move(field, foot->x, zero, 0.0f);
@@ -11604,18 +11609,16 @@ typedef struct disti_foot_tour {
     size_t n;
     disti_foot *feet, *others; /* of the scene, and those in an instance's space */
     float *gradient;
-    int worker, pass;
-    int leaves, leaf;          /* instances that are no scenes, and which of them comes next */
-    int first[DISTI_FEET];     /* leaf whose sphere is nearest */
-    float clear[DISTI_FEET];   /* to choose: how near that is; then how near what was not gone to may be */
-    unsigned char doubt[DISTI_FEET];
+    int worker;
+    int leaves, leaf; /* instances that are no scenes, and which of them comes next */
+    int pass;
 } disti_foot_tour;
 
 /* Of a foot, how near something must be to be wanted; 0: no more is. */
-static float disti_foot_wants(const disti_foot *foot, int doubt)
+static float disti_foot_wants(const disti_foot *foot)
 {
     if (foot->status == DIST_RAY_UNRESOLVED) return foot->radius;
-    if (foot->status != DIST_RAY_HIT || (foot->sign < 0.0f && !(doubt & DISTI_DOUBT_WITHIN))) return 0.0f;
+    if (foot->status != DIST_RAY_HIT || (foot->sign < 0.0f && !(foot->doubt & DISTI_DOUBT_WITHIN))) return 0.0f;
     return DISTI_MIN(foot->distance, foot->radius);
 }
 
@@ -11624,20 +11627,20 @@ static size_t disti_foot_list(disti_foot_tour *tour, const double center[3], dou
 {
     size_t count = 0;
     for (size_t i = 0; i < tour->n; i++) {
-        const disti_foot *foot = &tour->feet[i];
-        float within = disti_foot_wants(foot, tour->doubt[i]);
+        disti_foot *foot = &tour->feet[i];
+        float within = disti_foot_wants(foot);
         double d[3];
         if (!(within > 0.0f)) continue;
         for (int k = 0; k < 3; k++) d[k] = (double)foot->p[k] - center[k];
         float away = (float)DISTI_MIN(sqrt(disti_dot(d, d)) - radius, 3e38);
-        int first = tour->first[i] >= tour->leaf && tour->first[i] < tour->leaf + leaves;
-        if (tour->pass == DISTI_TOUR_CHOOSE ? !(away < tour->clear[i])
+        int first = foot->first >= tour->leaf && foot->first < tour->leaf + leaves;
+        if (tour->pass == DISTI_TOUR_CHOOSE ? !(away < foot->clear)
                                             : tour->pass == DISTI_TOUR_FIRST ? !first : first && !inner) continue;
         if (tour->pass == DISTI_TOUR_CHOOSE && !inner) {
-            tour->first[i] = tour->leaf;
-            tour->clear[i] = away;
+            foot->first = tour->leaf;
+            foot->clear = away;
         } else if (tour->pass != DISTI_TOUR_CHOOSE && !(away < within)) {
-            tour->clear[i] = DISTI_MIN(tour->clear[i], away);
+            foot->clear = DISTI_MIN(foot->clear, away);
             continue;
         }
         tour->bench->index[count++] = (int)i;
@@ -11654,7 +11657,7 @@ static size_t disti_foot_visit(disti_foot_tour *tour, const dist_field *field, c
     for (size_t i = 0; i < tour->n; i++) tour->others[i].status = DIST_RAY_SKIPPED;
     for (size_t j = 0; j < count; j++) {
         size_t i = (size_t)bench->index[j];
-        float q[3], wants = disti_foot_wants(&tour->feet[i], tour->doubt[i]);
+        float q[3], wants = disti_foot_wants(&tour->feet[i]);
         disti_chain_back(chain, tour->feet[i].p, q);
         wants = (float)DISTI_MIN((double)wants / chain->scale, 3e38);
         if (disti_foot_begin(field, q, wants, &tour->others[i])) bench->index[active++] = (int)i;
@@ -11663,14 +11666,14 @@ static size_t disti_foot_visit(disti_foot_tour *tour, const dist_field *field, c
     for (size_t i = 0; i < tour->n; i++) {
         disti_foot *foot = &tour->feet[i], *other = &tour->others[i];
         if (other->status == DIST_RAY_SKIPPED) continue;
-        if (other->status == DIST_RAY_NOT_FINITE) tour->doubt[i] |= DISTI_DOUBT_FINITE;
-        if (other->status == DIST_RAY_UNRESOLVED) tour->doubt[i] |= DISTI_DOUBT_FOUND;
+        if (other->status == DIST_RAY_NOT_FINITE) foot->doubt |= DISTI_DOUBT_FINITE;
+        if (other->status == DIST_RAY_UNRESOLVED) foot->doubt |= DISTI_DOUBT_FOUND;
         if (other->status == DIST_RAY_MISS)
-            tour->clear[i] = DISTI_MIN(tour->clear[i], (float)((double)other->distance * chain->scale));
+            foot->clear = DISTI_MIN(foot->clear, (float)((double)other->distance * chain->scale));
         if (other->sign < 0.0f) foot->sign = -1.0f;
         if (other->status != DIST_RAY_HIT) continue;
         if (other->distance > other->radius)
-            tour->clear[i] = DISTI_MIN(tour->clear[i], (float)((double)disti_foot_least(field, other) * chain->scale));
+            foot->clear = DISTI_MIN(foot->clear, (float)((double)disti_foot_least(field, other) * chain->scale));
         double x[3];
         float d[3];
         disti_chain_point(chain, other->best, x);
@@ -11690,7 +11693,7 @@ static size_t disti_foot_visit(disti_foot_tour *tour, const dist_field *field, c
                              (double)tour->others[i].normal[2]};
         double turned[3];
         if (tour->leaves > 1 && !(bench->sdf[j] > within)) {
-            tour->doubt[i] |= DISTI_DOUBT_WITHIN;
+            foot->doubt |= DISTI_DOUBT_WITHIN;
             continue;
         }
         disti_rotate(chain->rotation, n, turned);
@@ -11732,14 +11735,15 @@ static void disti_foot_led(disti_foot_tour *tour)
     size_t active = 0;
     for (size_t i = 0; i < tour->n; i++) {
         disti_foot *foot = &tour->feet[i], *other = &tour->others[i];
-        int lost = foot->status == DIST_RAY_UNRESOLVED && tour->doubt[i] & DISTI_DOUBT_FOUND;
+        int lost = foot->status == DIST_RAY_UNRESOLVED && foot->doubt & DISTI_DOUBT_FOUND;
         other->status = DIST_RAY_SKIPPED;
-        if (!lost && !(tour->doubt[i] & DISTI_DOUBT_WITHIN)) continue;
+        if (!lost && !(foot->doubt & DISTI_DOUBT_WITHIN)) continue;
         if (disti_foot_begin(tour->field, foot->p, foot->radius, other)) tour->bench->index[active++] = (int)i;
     }
     disti_foot_rounds(tour->field, tour->worker, tour->bench, tour->others, tour->gradient, active);
     for (size_t i = 0; i < tour->n; i++) {
         disti_foot *foot = &tour->feet[i], *other = &tour->others[i];
+        other->clear = foot->clear;
         if (other->status == DIST_RAY_HIT && (foot->status != DIST_RAY_HIT || other->distance < foot->distance))
             *foot = *other;
     }
@@ -11749,27 +11753,21 @@ static void disti_foot_scene(disti_foot_tour *tour)
 {
     const disti_chain here = {1.0, {1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0}, {0.0, 0.0, 0.0}};
     const dist_scene *scene = (const dist_scene *)tour->field->user;
-    tour->leaves = disti_scene_leaves(tour->field);
-    memset(tour->doubt, 0, sizeof tour->doubt);
-    for (size_t i = 0; i < tour->n; i++) {
-        tour->first[i] = -1;
-        tour->clear[i] = 3e38f;
-    }
     for (tour->pass = DISTI_TOUR_CHOOSE; tour->pass <= DISTI_TOUR_REST; tour->pass++) {
         tour->leaf = 0;
         disti_foot_pass(tour, scene, &here);
-        for (size_t i = 0; i < tour->n && tour->pass == DISTI_TOUR_CHOOSE; i++) tour->clear[i] = 3e38f;
+        for (size_t i = 0; i < tour->n && tour->pass == DISTI_TOUR_CHOOSE; i++) tour->feet[i].clear = 3e38f;
     }
     disti_foot_led(tour);
     for (size_t i = 0; i < tour->n; i++) {
         disti_foot *foot = &tour->feet[i];
         if (foot->status == DIST_RAY_HIT && foot->sign > 0.0f && foot->distance >= foot->radius)
-            foot->distance = DISTI_MIN(foot->distance, tour->clear[i]);
+            foot->distance = DISTI_MIN(foot->distance, foot->clear);
         if (foot->status != DIST_RAY_UNRESOLVED) continue;
-        if (tour->doubt[i] & DISTI_DOUBT_FINITE) foot->status = DIST_RAY_NOT_FINITE;
-        else if (tour->doubt[i] == 0 && foot->radius < 3e38f) {
+        if (foot->doubt & DISTI_DOUBT_FINITE) foot->status = DIST_RAY_NOT_FINITE;
+        else if (foot->doubt == 0 && foot->radius < 3e38f) {
             foot->status = DIST_RAY_MISS;
-            foot->distance = tour->clear[i];
+            foot->distance = foot->clear;
         }
     }
 }
@@ -11791,14 +11789,7 @@ static void disti_foot_task(void *arg, int index, int worker)
         if (disti_foot_begin(field, p, job->contacts ? p[3] : 3e38f, &feet[i])) bench.index[active++] = (int)i;
     }
     if (field->eval_fn == disti_scene_eval) {
-        disti_foot_tour tour;
-        tour.field = field;
-        tour.bench = &bench;
-        tour.n = n;
-        tour.feet = feet;
-        tour.others = others;
-        tour.gradient = gradient;
-        tour.worker = worker;
+        disti_foot_tour tour = {field, &bench, n, feet, others, gradient, worker, disti_scene_leaves(field), 0, 0};
         disti_foot_scene(&tour);
     } else {
         disti_foot_rounds(field, worker, &bench, feet, gradient, active);

@@ -13022,12 +13022,9 @@ static void disti_silhouette(const disti_tracer *tracer, int worker, const disti
     m->far = DISTI_MIN(DISTI_MAX(0.05f, 1.5e3f * (pixel / radius) * (pixel / radius)) * radius, m->plateau);
     /* within two pixels of the outline, within fewer where pixels are small */
     m->near = DISTI_MAX(0.005f, DISTI_MIN(2.0f, 150.0f * pixel / radius) * pixel / radius) * radius;
-    m->cells[0] = (int *)disti_take(bench->rest, &at, DISTI_NODE_CELLS, sizeof(int));
-    m->cells[1] = (int *)disti_take(bench->rest, &at, DISTI_NODE_CELLS, sizeof(int));
-    m->close = (int *)disti_take(bench->rest, &at, DISTI_TILE_RAYS, sizeof(int));
-    m->fits = (int *)disti_take(bench->rest, &at, DISTI_TILE_RAYS, sizeof(int));
-    m->fronts[0] = (int *)disti_take(bench->rest, &at, DISTI_TILE_RAYS, sizeof(int));
-    m->fronts[1] = (int *)disti_take(bench->rest, &at, DISTI_TILE_RAYS, sizeof(int));
+    int **rays[4] = {&m->close, &m->fits, &m->fronts[0], &m->fronts[1]};
+    for (int k = 0; k < 2; k++) m->cells[k] = (int *)disti_take(bench->rest, &at, DISTI_NODE_CELLS, sizeof(int));
+    for (int k = 0; k < 4; k++) *rays[k] = (int *)disti_take(bench->rest, &at, DISTI_TILE_RAYS, sizeof(int));
     DIST_ASSERT(at <= (size_t)DISTI_REST_BYTES);
     disti_minima_begin(m);
     if (m->close_count == 0) return;

@@ -10711,18 +10711,6 @@ static float *disti_bench_gradient(const disti_bench *bench, int index)
     return bench->gradient + 3 * (DISTI_TILE_RAYS + (size_t)index);
 }
 
-/* Exchanges two of the points to be asked for, and their rays. */
-static void disti_bench_swap(const disti_bench *bench, size_t i, size_t j)
-{
-    float p[3], *a = bench->points + 3 * i, *b = bench->points + 3 * j;
-    int index = bench->index[i];
-    memcpy(p, a, sizeof p);
-    memcpy(a, b, sizeof p);
-    memcpy(b, p, sizeof p);
-    bench->index[i] = bench->index[j];
-    bench->index[j] = index;
-}
-
 /* Marches the `active` rays listed in bench->index, in rounds: one packed batch of points a round, until only `enough`
    are left. Returns how many are still listed. Without budget they stay as they are: 0. With bench->gradient predicted
    samples come with their gradients: most are the last of their rays, next to the hit, and serve the normals, too. */
@@ -10733,33 +10721,39 @@ static size_t disti_trace_rounds(const disti_tracer *tracer, int worker, const d
     while (active > enough) {
         size_t kept = 0, sloped = 0;
         for (size_t i = 0; i < active; i++) {
-            disti_ray *ray = &bench->rays[bench->index[i]];
-            if (skips && !disti_skip(tracer, bench, bench->index[i], ray)) continue;
-            disti_ray_point(ray, ray->q, bench->points + 3 * kept);
-            bench->index[kept] = bench->index[i];
+            int index = bench->index[i];
+            disti_ray *ray = &bench->rays[index];
+            if (skips && !disti_skip(tracer, bench, index, ray)) continue;
             ray->own = bench->gradient && ray->mode == DISTI_PREDICT;
-            if (ray->own) disti_bench_swap(bench, sloped++, kept);
+            size_t place = ray->own ? sloped++ : kept;
+            if (place < kept) { /* those with gradients stand first: another makes room */
+                memcpy(bench->points + 3 * kept, bench->points + 3 * place, 3 * sizeof(float));
+                bench->index[kept] = bench->index[place];
+            }
+            disti_ray_point(ray, ray->q, bench->points + 3 * place);
+            bench->index[place] = index;
             kept++;
         }
         size_t asked = disti_query_sloped(tracer, worker, bench, kept, sloped);
         active = kept;
         kept = 0;
         for (size_t i = 0; i < asked; i++) {
-            disti_ray *ray = &bench->rays[bench->index[i]];
+            int index = bench->index[i];
+            disti_ray *ray = &bench->rays[index];
             if (ray->own) {
                 const float *g = bench->gradient + 3 * i, *v = ray->direction;
                 ray->incline = (g[0] * v[0] + g[1] * v[1] + g[2] * v[2]) * ray->sign;
-                memcpy(disti_bench_gradient(bench, bench->index[i]), g, 3 * sizeof(float));
+                memcpy(disti_bench_gradient(bench, index), g, 3 * sizeof(float));
             }
             if (ray->mode >= DISTI_BAND) bench->stats->refine_queries++;
             else bench->stats->march_queries++;
-            if (bench->balls) disti_publish(tracer, bench, bench->index[i], bench->sdf[i]);
+            if (bench->balls) disti_publish(tracer, bench, index, bench->sdf[i]);
             disti_stats_slope(tracer, ray, bench->sdf[i], bench->stats);
             if (disti_ray_advance(tracer, ray, bench->sdf[i])) {
-                bench->index[kept++] = bench->index[i];
+                bench->index[kept++] = index;
                 continue;
             }
-            bench->depth[bench->index[i]] = disti_hit_depth(ray);
+            bench->depth[index] = disti_hit_depth(ray);
             if (bench->budget) bench->budget->hits += (unsigned)disti_ray_is_hit(tracer, ray);
         }
         if (asked < active) return 0;

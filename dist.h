@@ -185,16 +185,17 @@ typedef void (*dist_seed_fn)(void *seed_user, size_t first, size_t count, const 
 
 /* What is traced: a function of the point that is negative inside, positive outside, zero on the surface, within a
    bounding sphere. Yours, an analytic one below, or a network (dist_shape_field). A plain value: copy it freely.
-   The callbacks must not call functions of this library with the same context. */
+   The callbacks must not call functions of this library with the same context; another field's eval_fn and fused_fn,
+   with the same worker, they may. */
 typedef struct dist_field {
     void *user;
-    /* sdf[i] = f(points[i]) for n points (n, 3); gradient (n, 3) is NULL or gets df/dpoint.
+    /* sdf[i] = f(points[i]) for n points (n, 3), any number; gradient (n, 3) is NULL or gets df/dpoint.
        Called from several workers at once; worker is 0..dist_context_workers-1. */
     void (*eval_fn)(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient);
     /* d_code[j] += sum over i of d_sdf[i] * df(points[i])/dcode[j]. NULL: there is no code, or fused_fn is set. */
     void (*adjoint_fn)(void *user, int worker, size_t n, const float *points, const float *d_sdf, double *d_code);
     /* Set by dist_shape_field, NULL in a field of your own: value, gradient and code adjoint in one pass, and the
-       weights'. */
+       weights'. The adjoint_fn of a field that wraps a net's calls it, with a seed_fn that tells its d_sdf. */
     void (*fused_fn)(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient,
                      dist_seed_fn seed_fn, void *seed_user, double *d_code);
     dist_status (*weights_fn)(void *user, dist_context *ctx, size_t n, const float *points, float *d_sdf,
@@ -230,13 +231,15 @@ typedef struct dist_field {
        net by the steepest places that dist_shape_create found. certified_far 0: certified */
     float certified, certified_far;
     float clamp;     /* |f| above this carries no distance (a clamped training); 0: none */
-    float detail;    /* the radius that the defaults of how.epsilon and normal_delta go by; 0: radius */
+    float detail;    /* the radius of the smallest part that is to be found: the defaults of how.epsilon, normal_delta
+                        and of how far a ray goes on trust go by it; 0: radius */
     /* multiply-adds of a query, about; a net's field has its own. Below 5000 a picture without silhouette and tape is
        traced with more queries and less bookkeeping: 1 where frames a second count, 0 where queries do */
     float cost;
     int kinks;       /* 1: grad f jumps (ReLU), which second_fn leaves out: a normal's gradient is by differences */
     int many;        /* 1: eval_fn is the faster the more points it gets at once, up to thousands */
-    int code_size;   /* length of d_code; for a render's gradient of a field of your own at most 992 */
+    int code_size;   /* length of d_code; for a render's gradient of a field of your own at most 992,
+                        or what a dist_field_backward with as long a code has made room for */
     size_t weight_count;       /* length of d_weights; 0: none */
     int color_code_size;       /* length of d_color_code */
     size_t color_weight_count; /* of a color net of its own; 0: the weights of color, if any, are among weight_count */
@@ -329,8 +332,8 @@ typedef struct dist_instance {
 
 /* Several instances as one field: f(p) = min over i of s_i f_i(R_i^T (p - t_i) / s_i). A point asks only the instances
    whose bounding spheres can hold the minimum, nearest first, and none of them outside its sphere: there f_i goes on as
-   a lower bound of the distance, exact up to a fifth of the sphere's radius. The defaults of how.epsilon and
-   normal_delta go by the smallest instance's radius in the world, but are no smaller than float's noise, 5e-7 of the
+   a lower bound of the distance, mostly below it. The defaults of how.epsilon and normal_delta, and how far a ray goes
+   on trust, go by the smallest instance's radius in the world, epsilon no smaller than float's noise, 5e-7 of the
    scene's. Every point is held against every sphere: fast up to some hundred instances; more are better made scenes of
    scenes. Belongs to the context that made it. */
 typedef struct dist_scene dist_scene;
@@ -430,9 +433,9 @@ typedef struct dist_net_desc {
     int output_linear;/* 0: tanh at the end, 1: nothing */
     int levels;       /* Fourier levels beside the point: sin and cos of pi 2^k p, k below levels; at most 16 */
     int color;        /* 1: a texture: r, g, b in place of the distance, with a sigmoid at the end unless linear */
-    int geometric;    /* 1: starts near the distance to a sphere of half the bound, where f is 0 in the mean; for ReLU,
-                         and softplus where scale * bound is some 30 or more (f grows slower than the distance then:
-                         by half of it at 100). Fourier levels have no share in it. 0: PyTorch's start */
+    int geometric;    /* 1: starts near the distance to a sphere of half the bound, where f is 0 in the mean; ReLU and
+                         softplus only, of that best where scale * bound is some 30 or more (f grows slower than the
+                         distance then: by half of it at 100). Fourier levels have no share in it. 0: PyTorch's start */
     float bound;      /* radius of the sphere that holds the shape, 1e-6 to 1e6; 0: 1 */
     float clamp;      /* 0: 0.1 with a code, none without */
     unsigned seed;
@@ -669,9 +672,9 @@ typedef struct dist_images {
     float *distance;       /* along the ray; likewise */
     float *normal;         /* (h, w, 3), unit, outward, in how.normal_space (the camera's); 0 at a miss */
     float *silhouette;     /* min |f| along the ray - epsilon, signed: < 0 at a hit, > 0 at a miss. Far from the
-                              outline, from |f| of about .05 of the radius on, in coarse pictures from more, it is
-                              interpolated or another local minimum; of a ray beside the bounding sphere its distance
-                              from that */
+                              outline, mostly from |f| of about .05 of the radius on, in coarse pictures from more, it
+                              is interpolated or another local minimum; of a ray beside the bounding sphere its
+                              distance from that */
     float *color;          /* (h, w, 3); how.background_color at a miss and where it is not finite */
     unsigned char *mask;   /* 1 hit, 0 not: the authority */
     unsigned char *status; /* DIST_RAY_* */
@@ -683,7 +686,7 @@ typedef struct dist_images {
                               ray crept along a surface before its hit, up to 0.02 of the radius of that way, too.
                               With warm_start of the surface that is seen: another one may be seen late (dist_tape).
                               DIST_TRACE_PAPER: |f| of a hit's sample, no bound */
-    dist_stats *stats;
+    dist_stats *stats;     /* set by dist_render, added to by dist_render_backward */
 } dist_images;
 
 /* Keeps what the gradient needs: one distance and one status a pixel, and the paper's K samples where asked for. */
@@ -745,8 +748,8 @@ DIST_API float dist_loss_normal(size_t n, const float *normal, const float *targ
 DIST_API float dist_loss_silhouette(size_t n, const float *silhouette, const unsigned char *target, float weight,
                                     float *d_silhouette);
 /* The same as the paper's authors average it: the mean of S over the pixels with S_gt = 1 and S > 0, plus the mean of
-   -S over those with S_gt = 0 and S < 0. It does not fade as the wrong pixels become few. Better beside a mean over
-   depths */
+   -S over those with S_gt = 0 and S < 0. It does not fade as the wrong pixels become few. For use beside a mean
+   over depths: alone it can run away */
 DIST_API float dist_loss_silhouette_wrong(size_t n, const float *silhouette, const unsigned char *target, float weight,
                                           float *d_silhouette);
 /* mean |color - target| over hit pixels and channels */
@@ -777,9 +780,9 @@ typedef struct dist_photometric_desc {
    over the channels and the pixels that hit, 0 < depth < 1e5 as of a target, lie more than 1e-9 in front of `from` and
    inside its picture, and are not hidden there:
    (z of p in `from` - its depth at x')^2 < visibility; from->depth may be NULL: nothing is hidden. Windows of SSIM
-   count where all nine pixels do. Adds dL/ddepth of `to` to d_depth (h, w) and, each unless NULL, dL/d(rotation,
-   translation) of `to` and then of `from` to d_cameras (12), at this depth: what the depth itself does as the camera
-   moves is dist_render_backward's to add. What is visible is held constant.
+   (uniform; 1e-4 and 9e-4 its constants) count where all nine pixels do. Adds dL/ddepth of `to` to d_depth (h, w) and,
+   each unless NULL, dL/d(rotation, translation) of `to` and then of `from` to d_cameras (12), at this depth: what the
+   depth itself does as the camera moves is dist_render_backward's to add. What is visible is held constant.
    desc may be NULL. A camera that dist_render refuses, an ssim out of range, a visibility that is not finite: 0 and no
    gradient. */
 DIST_API float dist_loss_photometric(const dist_photo *to, const dist_photo *from, const dist_photometric_desc *desc,
@@ -1333,7 +1336,7 @@ static dist_status disti_limits(dist_context *ctx, const char *function, size_t 
         memcpy(text + n, ": ", 2);
         memcpy(text + n + 2, limits->name, strlen(limits->name) + 1);
         return disti_fail(ctx, DIST_BAD_ARGUMENT,
-                          limits->high > 1e38  ? "%s is %d, must be finite, 0 or positive"
+                          limits->high > 1e38  ? "%s is %d, must be 0 or more, below 3e38"
                           : limits->low > 0.0 ? "%s is %d, must be 1 to %d"
                                               : "%s is %d, must be 0 to %d",
                           text, x, limits->high);
@@ -9164,7 +9167,9 @@ static dist_status disti_net_desc_check(dist_context *ctx, const dist_net_desc *
         {"layers", (double)d->layers, 1, DISTI_MAX_LAYERS - 1}, {"width", (double)d->width, 1, 4096},
         {"skip", (double)d->skip, 0, (double)d->layers - 1.0}, {"levels", (double)d->levels, 0, DISTI_MAX_LEVELS},
         {"code_size", (double)d->code_size, 0, 4096}, {"code_count", (double)d->code_count, 0, 1e7},
-        {"activation", (double)d->activation, 0, DIST_ACTIVATION_NONE}};
+        {"activation", (double)d->activation, 0, DIST_ACTIVATION_NONE},
+        {"output_linear", (double)d->output_linear, 0, 1}, {"color", (double)d->color, 0, 1},
+        {"geometric", (double)d->geometric, 0, 1}};
     dist_status status = disti_limits(ctx, name, sizeof limits / sizeof limits[0], limits);
     if (status != DIST_OK) return status;
     const float value[3] = {d->scale, d->bound, d->clamp};
@@ -9175,6 +9180,10 @@ static dist_status disti_net_desc_check(dist_context *ctx, const dist_net_desc *
                               : i == 1 ? "dist_net_create: bound is %d, must be 1e-6 to 1e6, or 0"
                                        : "dist_net_create: clamp is %d, must be 0 to 1e6",
                               NULL, (double)value[i], 0);
+    if (d->geometric && d->activation != DIST_ACTIVATION_RELU && d->activation != DIST_ACTIVATION_SOFTPLUS)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT,
+                          "dist_net_create: geometric is 1 with activation %d, must be 0: there is none but for ReLU "
+                          "and softplus", NULL, (double)d->activation, 0);
     return DIST_OK;
 }
 
@@ -14928,7 +14937,10 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     if (status != DIST_OK) return status;
     if (!out) return disti_refuse(ctx, "%s: out is NULL", name);
     if (tracer.how.any_hit || tracer.how.max_distance > 0.0f)
-        return disti_refuse(ctx, "%s: how.any_hit and max_distance are for dist_trace", name);
+        return disti_fail(ctx, DIST_BAD_ARGUMENT,
+                          tracer.how.any_hit ? "%s: how.any_hit is %d, must be 0: it is for dist_trace"
+                                             : "%s: how.max_distance is %d, must be 0: it is for dist_trace",
+                          name, tracer.how.any_hit ? 1.0 : (double)tracer.how.max_distance, 0);
     if (out->color) status = disti_color_check(ctx, field, 0, name);
     if (status != DIST_OK) return status;
     if (tape && tape->ctx != ctx) return disti_refuse(ctx, "%s: tape belongs to another context", name);
@@ -16341,11 +16353,11 @@ static dist_status disti_extract_check(dist_context *ctx, const dist_field *fiel
     if (desc->resolution != 0 && (desc->resolution < 2 || desc->resolution > 2048))
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: resolution is %d, must be 2 to 2048, or 0", name,
                           desc->resolution, 0);
-    if (desc->refine < 0 || desc->refine > 8)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: refine is %d, must be 0 to 8", name, desc->refine, 0);
     if (!disti_finite(desc->level))
         return disti_fail(ctx, DIST_NOT_FINITE, "%s: level is %d, must be finite", name, (double)desc->level, 0);
-    return DIST_OK;
+    const disti_limit limits[] = {{"no_skip", (double)desc->no_skip, 0, 1}, {"normals", (double)desc->normals, 0, 1},
+                                  {"refine", (double)desc->refine, 0, 8}};
+    return disti_limits(ctx, name, sizeof limits / sizeof limits[0], limits);
 }
 
 DIST_API dist_mesh *dist_mesh_extract(dist_context *ctx, const dist_field *field, const dist_mesh_desc *desc)

@@ -352,7 +352,17 @@ TEST(bad_descs_and_fields_are_refused)
     desc = mesh_desc(16);
     desc.refine = 9;
     CHECK(!dist_mesh_extract(ctx, &field, &desc));
-    CHECK_TEXT("refine is 9", dist_context_message(ctx));
+    CHECK_TEXT("refine is 9, must be 0 to 8", dist_context_message(ctx));
+    dist_context_clear(ctx);
+    desc = mesh_desc(16);
+    desc.normals = 2;
+    CHECK(!dist_mesh_extract(ctx, &field, &desc));
+    CHECK_TEXT("normals is 2, must be 0 to 1", dist_context_message(ctx));
+    dist_context_clear(ctx);
+    desc = mesh_desc(16);
+    desc.no_skip = -3;
+    CHECK(!dist_mesh_extract(ctx, &field, &desc));
+    CHECK_TEXT("no_skip is -3, must be 0 to 1", dist_context_message(ctx));
     dist_context_clear(ctx);
     const uint32_t nan = 0x7fc00000u;
     desc = mesh_desc(16);

@@ -815,7 +815,12 @@ TEST(a_net_made_has_the_form_asked_for)
 
 TEST(a_net_that_cannot_be_made_is_refused)
 {
-    for (int k = 0; k < 12; k++) {
+    static const char *const says[] = {
+        "layers is 32, must be 1 to 31", "width is 4097", "skip is 4", "skip is -1", "code_size is -1", "activation is 6",
+        "scale is -1", "bound is -1", "bound is 1100000", "scale is 1100000", "clamp is 1100000, must be 0 to 1e6",
+        "layers is -1", "geometric is 2, must be 0 to 1", "color is -3, must be 0 to 1", "output_linear is 2",
+        "geometric is 1 with activation 3, must be 0"};
+    for (int k = 0; k < (int)(sizeof says / sizeof says[0]); k++) {
         dist_context *ctx = test_context();
         dist_net_desc d = small_desc();
         switch (k) {
@@ -830,12 +835,16 @@ TEST(a_net_that_cannot_be_made_is_refused)
         case 8: d.bound = 1.1e6f; break; /* what a file may not say: it could be saved, but not loaded */
         case 9: d.scale = 1.1e6f; break;
         case 10: d.clamp = 1.1e6f; break;
-        default: d.layers = -1; break;
+        case 11: d.layers = -1; break;
+        case 12: d.geometric = 2; break;
+        case 13: d.color = -3; break;
+        case 14: d.output_linear = 2; break;
+        default: d.geometric = 1, d.activation = DIST_ACTIVATION_SINE; break;
         }
         CHECK(dist_net_create(ctx, &d) == NULL);
         CHECK_STATUS(DIST_BAD_ARGUMENT, dist_context_status(ctx), ctx);
         CHECK_TEXT("dist_net_create: ", dist_context_message(ctx));
-        if (k == 10) CHECK_TEXT("clamp is 1100000, must be 0 to 1e6", dist_context_message(ctx));
+        CHECK_TEXT(says[k], dist_context_message(ctx));
         dist_context_destroy(ctx);
     }
 }

@@ -112,10 +112,13 @@ TEST(any_hit_and_max_distance_are_refused_where_they_mean_nothing)
         how.any_hit = i == 0 ? 2 : i == 1;
         how.max_distance = i == 2 ? 1.0f : i == 3 ? -1.0f : 0.0f;
         CHECK_STATUS(DIST_BAD_ARGUMENT, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+        if (i == 1) CHECK_TEXT("how.any_hit is 1, must be 0: it is for dist_trace", dist_context_message(ctx));
+        if (i == 2) CHECK_TEXT("how.max_distance is 1, must be 0: it is for dist_trace", dist_context_message(ctx));
+        dist_context_clear(ctx);
         CHECK_STATUS(i == 1 || i == 2 ? DIST_OK : DIST_BAD_ARGUMENT,
                      dist_trace(ctx, &field, 0, NULL, NULL, &how, NULL, NULL), ctx);
+        dist_context_clear(ctx);
     }
-    dist_context_clear(ctx);
     memset(&how, 0, sizeof how);
     how.trace = DIST_TRACE_PAPER; /* and what is for pictures, by dist_trace */
     CHECK_STATUS(DIST_BAD_ARGUMENT, dist_trace(ctx, &field, 0, NULL, NULL, &how, NULL, NULL), ctx);

@@ -10297,7 +10297,7 @@ static int disti_ray_marched(const disti_tracer *tracer, disti_ray *ray, disti_s
         (ray->side >= 8 || disti_ray_alone(tracer, ray, now, ray->b, 2e-3f)))
         return disti_ray_open_bracket(tracer, ray, now, ray->b);
     float gap = step - radius - disti_empty(tracer, fabsf(f)); /* what neither sphere covers */
-    if (tracer->how.certified) gap += 2.0f * tracer->noise / tracer->lipschitz; /* spheres touch at a flat sheet */
+    if (tracer->how.certified) gap += 0.25f * tracer->noise / tracer->lipschitz; /* at a flat sheet spheres touch */
     float sphere = (tracer->how.certified ? 1.0f : 1.0001f) * radius + 4.8e-7f * tracer->field->radius;
     int back = ray->mode != DISTI_SKIP && step > sphere;
     float off = f - (ray->front.f + ray->slope * step);

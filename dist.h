@@ -13853,7 +13853,7 @@ static int disti_warm_again(disti_warm *warm, int i)
     ray->mode = DISTI_FIRST;
     ray->best = ray->q = ray->start;
     ray->fbest = 3e38f;
-    ray->b.f = ray->slope = ray->error = 0.0f;
+    ray->front.f = ray->crept.f = ray->a.f = ray->b.f = ray->slope = ray->error = 0.0f;
     ray->steps = 0;
     ray->kept = 0;
     warm->bench->depth[i] = 0.0f;

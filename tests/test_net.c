@@ -817,9 +817,9 @@ TEST(a_net_that_cannot_be_made_is_refused)
 {
     static const char *const says[] = {
         "layers is 32, must be 1 to 31", "width is 4097", "skip is 4", "skip is -1", "code_size is -1",
-        "activation is 6", "scale is -1", "bound is -1", "bound is 1100000", "scale is 1100000", "clamp is 1100000, must be 0 to 1e6",
-        "layers is -1", "geometric is 2, must be 0 to 1", "color is -3, must be 0 to 1", "output_linear is 2",
-        "geometric is 1 with activation 3, must be 0"};
+        "activation is 6", "scale is -1", "bound is -1", "bound is 1100000", "scale is 1100000",
+        "clamp is 1100000, must be 0 to 1e6", "layers is -1", "geometric is 2, must be 0 to 1",
+        "color is -3, must be 0 to 1", "output_linear is 2", "geometric is 1 with activation 3, must be 0"};
     for (int k = 0; k < (int)(sizeof says / sizeof says[0]); k++) {
         dist_context *ctx = test_context();
         dist_net_desc d = small_desc();

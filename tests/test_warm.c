@@ -540,6 +540,36 @@ TEST(a_warm_start_needs_its_tape)
     scene_close(&s);
 }
 
+/* What a ray that is traced anew knew before is no sample of that trace: the distance to a sheet is as steep as 1. */
+TEST(a_warm_start_meets_no_slope_that_is_not_there)
+{
+    enum { WIDE = 40, HIGH = 32 };
+    float sheet[6] = {0, 0, 0, 0, 0.5f, 0.5f}, up[3] = {0, 1, 0};
+    dist_context *ctx = shape_context();
+    dist_field field = dist_field_box(sheet);
+    for (int k = 6; k < 16; k++) {
+        float r = field.radius, eye[3] = {0.8f * r * (1.0f + 0.02f * (float)k), 0.5f * r, 2.5f * r};
+        dist_camera camera = dist_camera_look_at(WIDE, HIGH, 0.7f, eye, NULL, up);
+        dist_render_desc how;
+        dist_images out;
+        dist_stats stats;
+        memset(&how, 0, sizeof how);
+        memset(&out, 0, sizeof out);
+        how.warm_start = 1;
+        out.distance = cold.distance;
+        out.mask = cold.mask;
+        out.stats = &stats;
+        dist_tape *tape = dist_tape_create(ctx, &camera, &how);
+        for (int i = 0; i < 3; i++) {
+            CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, tape), ctx);
+            CHECK(stats.hits > 100);
+            CHECK_EQUAL(0, stats.steepest);
+        }
+        dist_tape_destroy(tape);
+    }
+    dist_context_destroy(ctx);
+}
+
 int main(int argc, char **argv)
 {
     test_begin(argc, argv);
@@ -556,5 +586,6 @@ int main(int argc, char **argv)
     RUN(moved_hits_of_a_fine_epsilon_keep_their_error_bounds);
     RUN(hits_that_no_one_has_asked_since_they_moved_keep_their_errors);
     RUN(a_warm_start_needs_its_tape);
+    RUN(a_warm_start_meets_no_slope_that_is_not_there);
     return test_report();
 }

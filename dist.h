@@ -9872,8 +9872,8 @@ static int disti_ray_open_bracket(const disti_tracer *tracer, disti_ray *ray, di
     ray->incline = (b.f - a.f) / ray->width;
     ray->side = 0;
     float epsilon = disti_ray_epsilon(tracer, ray, a.s);
-    int small = ray->width > 0.0f && ray->width <= 2.0f * epsilon;
-    if (tracer->how.certified && small && a.f > b.f && !disti_coarse(tracer, epsilon)) {
+    int narrow = ray->width > 0.0f && ray->width <= 2.0f * epsilon;
+    if (tracer->how.certified && narrow && a.f > b.f && !disti_coarse(tracer, epsilon)) {
         ray->slope = ray->incline;
         float error = DISTI_MAX(ray->width, disti_ray_kink(tracer, ray, -ray->incline));
         return disti_ray_end(ray, DIST_RAY_HIT, a.s + ray->width * (a.f / (a.f - b.f)), 0.0f, error);

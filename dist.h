@@ -10806,12 +10806,9 @@ static void disti_stats_begin(dist_context *ctx)
     }
 }
 
-/* Counts are whole numbers and extremes: the order of the workers does not matter. dist_stats begins with nothing but
-   counts, and `capped` is the first of those that only the backward pass makes. */
+/* Counts are whole numbers and extremes: the order of the workers does not matter. */
 static void disti_stats_end(dist_context *ctx, const disti_tracer *tracer, dist_stats *out)
 {
-    const size_t counts = offsetof(dist_stats, capped) / sizeof(unsigned long long);
-    unsigned long long *to = (unsigned long long *)(void *)out;
     if (!out) return;
     memset(out, 0, sizeof *out);
     out->epsilon = 3e38f;
@@ -10819,8 +10816,20 @@ static void disti_stats_end(dist_context *ctx, const disti_tracer *tracer, dist_
         disti_bench bench;
         disti_bench_init(ctx, worker, &bench);
         const dist_stats *s = bench.stats;
-        const unsigned long long *from = (const unsigned long long *)(const void *)s;
-        for (size_t k = 0; k < counts; k++) to[k] += from[k];
+        out->rays += s->rays;
+        out->rays_in_sphere += s->rays_in_sphere;
+        out->queries += s->queries;
+        out->cone_queries += s->cone_queries;
+        out->march_queries += s->march_queries;
+        out->refine_queries += s->refine_queries;
+        out->silhouette_queries += s->silhouette_queries;
+        out->normal_queries += s->normal_queries;
+        out->color_queries += s->color_queries;
+        out->hits += s->hits;
+        out->unresolved += s->unresolved;
+        out->inside += s->inside;
+        out->plateau += s->plateau;
+        out->not_finite += s->not_finite;
         out->operations += disti_counter_of(ctx, worker)->dense;
         out->operations_done += disti_counter_of(ctx, worker)->done;
         if (s->steepest > out->steepest) out->steepest = s->steepest;

@@ -1758,10 +1758,7 @@ static dist_status disti_context_begin(dist_context *ctx, const dist_context_des
     if (!ctx->scheduler.run_fn) ctx->workers = 1;
 #endif
     ctx->scratch = (unsigned char *)disti_alloc_array(ctx, (size_t)ctx->workers, DISTI_SCRATCH_BYTES);
-    if (!ctx->scratch) return DIST_OUT_OF_MEMORY;
-    for (int worker = 0; worker < ctx->workers; worker++)
-        memset(disti_counter_of(ctx, worker), 0, sizeof(disti_counter));
-    return DIST_OK;
+    return ctx->scratch ? DIST_OK : DIST_OUT_OF_MEMORY;
 }
 
 /* desc's allocator, or malloc's. 0: only half of one, or none and no malloc. */
@@ -1799,7 +1796,11 @@ DIST_API dist_context *dist_context_create(const dist_context_desc *desc)
     dist_context *ctx = (dist_context *)allocator.alloc_fn(allocator.user, sizeof(dist_context), DISTI_ALIGNMENT);
     if (!ctx) return disti_no_context(&d, DIST_OUT_OF_MEMORY, "dist_context_create: out of memory");
     int aligned = disti_is_aligned(ctx);
-    if (aligned && disti_context_begin(ctx, &d, &allocator) != DIST_OUT_OF_MEMORY) return ctx;
+    if (aligned && disti_context_begin(ctx, &d, &allocator) != DIST_OUT_OF_MEMORY) {
+        for (int worker = 0; ctx->scratch && worker < ctx->workers; worker++)
+            memset(disti_counter_of(ctx, worker), 0, sizeof(disti_counter));
+        return ctx;
+    }
     allocator.free_fn(allocator.user, ctx, sizeof *ctx);
     if (aligned) return NULL; /* the logger knows */
     return disti_no_context(&d, DIST_OUT_OF_MEMORY, "dist_context_create: what alloc_fn returned is not aligned");

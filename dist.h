@@ -9523,7 +9523,7 @@ typedef struct disti_tracer {
     const dist_field *field;
     dist_render_desc how;
     float lipschitz, epsilon, noise;
-    float detail;     /* the field's, or its radius */
+    float detail;     /* the field's, or its radius: lengths that are taken on trust go by it */
     float far, ratio; /* from |f| = far on the slope is at most lipschitz / ratio */
     const dist_cache *cache; /* that rays are to use; NULL: none */
     float shy;               /* by how much less than it says a ball of it is trusted: to where |f| is epsilon */
@@ -9837,7 +9837,7 @@ static float disti_ray_room(const disti_tracer *tracer, disti_sample a, disti_sa
     return b.s - a.s - disti_empty(tracer, a.f) - disti_empty(tracer, -b.f);
 }
 
-/* Whether that is no more than `most` of the radius; certified: than epsilon, and so near the hit is the first one. */
+/* Whether that is no more than `most` of the detail; certified: than epsilon, and so near the hit is the first one. */
 static int disti_ray_alone(const disti_tracer *tracer, const disti_ray *ray, disti_sample a, disti_sample b, float most)
 {
     float room = tracer->how.certified ? disti_ray_epsilon(tracer, ray, ray->front.s) : most * tracer->detail;
@@ -9883,7 +9883,7 @@ static int disti_ray_open_bracket(const disti_tracer *tracer, disti_ray *ray, di
 }
 
 /* Steps no shorter than this are taken along a surface that the ray hardly approaches: a pixel, from .0005 to .003 of
-   the radius, so that what a chord cuts off is a small part of one. They grow from the 20th query on, so that a plateau
+   the detail, so that what a chord cuts off is a small part of one. They grow from the 20th query on, so that a plateau
    of f ends within the budget. */
 static float disti_ray_floor(const disti_tracer *tracer, const disti_ray *ray)
 {
@@ -9912,7 +9912,7 @@ static void disti_ray_creeps(const disti_tracer *tracer, disti_ray *ray, disti_s
     }
 }
 
-/* A step to where f ends if it falls like that (above 0), at most three spheres or a hundredth of the radius far; 0:
+/* A step to where f ends if it falls like that (above 0), at most three spheres or a hundredth of the detail far; 0:
    none is taken. Nothing proves it, so not before a sample that lies in a solid, where what is proven counts; a
    certified ray takes it as soon as the spheres at its two ends leave no more than epsilon between them. */
 static float disti_ray_jump(const disti_tracer *tracer, const disti_ray *ray, float falls, float radius)

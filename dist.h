@@ -1887,16 +1887,16 @@ typedef struct disti_gemm_weights {
     int out, rows, columns;
 } disti_gemm_weights;
 
-/* Few points: y[c][o] = max(0, bias[o] + sum_k weights(o, k) x[c][k]), gemm's bits, over the rows listed in ascending
-   order; sum[o] = that of y[.][o], 0 only where all are. bias, y and sum are written or read up to out rounded up to
-   8. */
-enum { DISTI_FEW_POINTS = 12 };
+/* Few points: y[c][o] = bias[o] + sum_k weights(o, k) x[c][k], gemm's bits, over the rows listed in ascending order,
+   with relu no less than 0; sum[o] = that of y[.][o], 0 then only where all are. bias, y and sum are written or read up
+   to out rounded up to 8. */
+enum { DISTI_FEW_POINTS = 12, DISTI_FEW_LANES = 16 };
 typedef struct disti_few {
     const float *weights, *bias, *x; /* x (points, stride) */
     const int *list;
     float *y, *sum; /* y (points, stride) */
     size_t stride;
-    int rows, count, out, points;
+    int rows, count, out, points, relu;
 } disti_few;
 
 /* Of least to most points, `points` go first by themselves: gemm takes whole vectors of points. */
@@ -1968,8 +1968,10 @@ typedef struct disti_kernels {
     void (*activate)(int activation, float scale, size_t n, float *y, float *slope);
     /* its adjoint of n rows, in place: disti_activate_backward */
     void (*activate_back)(size_t n, size_t half, const float *slope, float *d);
-    /* LayerNorm of a block: disti_norm_lanes over all lanes */
+    /* LayerNorm of a block: disti_norm_lanes over all lanes; of few points: disti_norm_points */
     void (*norm)(int units, float epsilon, const float *gamma, const float *beta, float *x, float *hat, float *inverse);
+    void (*norm_few)(int units, int points, size_t stride, float epsilon, const float *gamma, const float *beta,
+                     const float *x, float *hat, float *y);
     void (*norm_back)(int units, const float *gamma, size_t half, const float *hat, const float *inverse, float *d);
     /* of values in the first half of the lanes and tangents in the second: disti_norm_tangent_lanes, and of n rows
        disti_activate_tangents */
@@ -2366,30 +2368,55 @@ DISTI_INLINE void disti_activate_tangents(int activation, float scale, size_t n,
     }
 }
 
+/* LayerNorm's mu and 1 / sigma, and x - mu in hat, of `lanes` lanes in rows of `stride`. */
+DISTI_INLINE void disti_norm_sums(int units, size_t lanes, size_t stride, float epsilon, const float *DISTI_RESTRICT x,
+                                  float *DISTI_RESTRICT hat, float *DISTI_RESTRICT mean, float *DISTI_RESTRICT inverse)
+{
+    float variance[DISTI_BLOCK];
+    size_t count = (size_t)units;
+    for (size_t c = 0; c < lanes; c++) mean[c] = variance[c] = 0.0f;
+    for (size_t u = 0; u < count; u++)
+        for (size_t c = 0; c < lanes; c++) mean[c] += x[u * stride + c];
+    for (size_t c = 0; c < lanes; c++) mean[c] /= (float)units;
+    for (size_t u = 0; u < count; u++) {
+        for (size_t c = 0; c < lanes; c++) {
+            float d = x[u * stride + c] - mean[c];
+            hat[u * stride + c] = d;
+            variance[c] += d * d;
+        }
+    }
+    for (size_t c = 0; c < lanes; c++) inverse[c] = 1.0f / sqrtf(variance[c] / (float)units + epsilon);
+}
+
 /* forward   mu = mean_u x, v = mean_u (x - mu)^2, hat = (x - mu) / sqrt(v + eps), y = gamma hat + beta, for each of the
    first `lanes` lanes */
 DISTI_INLINE void disti_norm_lanes(int units, size_t lanes, float epsilon, const float *gamma, const float *beta,
                                    float *DISTI_RESTRICT x, float *DISTI_RESTRICT hat, float *DISTI_RESTRICT inverse)
 {
-    float mean[DISTI_BLOCK], variance[DISTI_BLOCK];
-    size_t count = (size_t)units;
-    for (size_t c = 0; c < lanes; c++) mean[c] = variance[c] = 0.0f;
-    for (size_t u = 0; u < count; u++)
-        for (size_t c = 0; c < lanes; c++) mean[c] += x[u * DISTI_BLOCK + c];
-    for (size_t c = 0; c < lanes; c++) mean[c] /= (float)units;
-    for (size_t u = 0; u < count; u++) {
-        for (size_t c = 0; c < lanes; c++) {
-            float d = x[u * DISTI_BLOCK + c] - mean[c];
-            hat[u * DISTI_BLOCK + c] = d;
-            variance[c] += d * d;
-        }
-    }
-    for (size_t c = 0; c < lanes; c++) inverse[c] = 1.0f / sqrtf(variance[c] / (float)units + epsilon);
-    for (size_t u = 0; u < count; u++) {
+    float mean[DISTI_BLOCK];
+    disti_norm_sums(units, lanes, DISTI_BLOCK, epsilon, x, hat, mean, inverse);
+    for (size_t u = 0; u < (size_t)units; u++) {
         for (size_t c = 0; c < lanes; c++) {
             float h = hat[u * DISTI_BLOCK + c] * inverse[c];
             hat[u * DISTI_BLOCK + c] = h;
             x[u * DISTI_BLOCK + c] = gamma[u] * h + beta[u];
+        }
+    }
+}
+
+/* Its bits (with -ffast-math to rounding) for points y (points, stride), which x has as (units, DISTI_FEW_LANES): that
+   is what the sums go over, in the same order. */
+DISTI_INLINE void disti_norm_points(int units, int points, size_t stride, float epsilon, const float *gamma,
+                                    const float *beta, const float *DISTI_RESTRICT x, float *DISTI_RESTRICT hat,
+                                    float *DISTI_RESTRICT y)
+{
+    float mean[DISTI_FEW_LANES], inverse[DISTI_FEW_LANES];
+    disti_norm_sums(units, DISTI_FEW_LANES, DISTI_FEW_LANES, epsilon, x, hat, mean, inverse);
+    for (int c = 0; c < points; c++, y += stride) {
+        const float middle = mean[c], factor = inverse[c];
+        for (size_t u = 0; u < (size_t)units; u++) {
+            float h = (y[u] - middle) * factor;
+            y[u] = gamma[u] * h + beta[u];
         }
     }
 }
@@ -2478,7 +2505,7 @@ static void disti_few_scalar(const disti_few *g)
             float *y = g->y + c * g->stride + o;
 #define DISTI_BEGIN(j) float a##j = bias[j], b##j = bias[4 + j];
 #define DISTI_TERM(j) a##j += w[j] * x[k]; b##j += w[4 + j] * x[k];
-#define DISTI_END(j) y[j] = a##j <= 0.0f ? 0.0f : a##j; y[4 + j] = b##j <= 0.0f ? 0.0f : b##j;
+#define DISTI_END(j) y[j] = a##j; y[4 + j] = b##j;
             DISTI_FOUR(DISTI_BEGIN)
             for (int i = 0; i < g->count; i++) {
                 const size_t k = (size_t)g->list[i];
@@ -2486,6 +2513,7 @@ static void disti_few_scalar(const disti_few *g)
                 DISTI_FOUR(DISTI_TERM)
             }
             DISTI_FOUR(DISTI_END)
+            for (int i = 0; i < 8 && g->relu; i++) y[i] = y[i] <= 0.0f ? 0.0f : y[i];
 #undef DISTI_BEGIN
 #undef DISTI_TERM
 #undef DISTI_END
@@ -2631,6 +2659,9 @@ DISTI_INLINE void disti_angles(double base, int levels, const float *DISTI_RESTR
     function void disti_norm_##isa(int units, float epsilon, const float *gamma, const float *beta, float *x,          \
                                     float *hat, float *inverse)                                                        \
     { disti_norm_lanes(units, DISTI_BLOCK, epsilon, gamma, beta, x, hat, inverse); }                                   \
+    function void disti_norm_few_##isa(int units, int points, size_t stride, float epsilon, const float *gamma,        \
+                                        const float *beta, const float *x, float *hat, float *y)                       \
+    { disti_norm_points(units, points, stride, epsilon, gamma, beta, x, hat, y); }                                     \
     function void disti_activate_back_##isa(size_t n, size_t half, const float *slope, float *d)                       \
     { disti_activate_backward(n, half, slope, d); }                                                                    \
     function void disti_norm_tangents_##isa(int units, float epsilon, const float *gamma, const float *beta, float *x, \
@@ -3076,7 +3107,8 @@ DISTI_PLAIN(scalar, static)
 #define DISTI_FEW_MAC(i, j) DISTI_FMA(a##i##j, b, v##j);
 #define DISTI_FEW_ROW(i, V) { const DISTI_VEC b = DISTI_SET1(x##i[k]); DISTI_X##V(DISTI_FEW_MAC, i) }
 #define DISTI_FEW_STORE1(i, j)                                                                                         \
-    a##i##j = DISTI_RELU(DISTI_ADD(a##i##j, DISTI_TWO(g->bias + at##j, g->bias + to##j)));                             \
+    a##i##j = DISTI_ADD(a##i##j, DISTI_TWO(g->bias + at##j, g->bias + to##j));                                         \
+    if (g->relu) a##i##j = DISTI_RELU(a##i##j);                                                                        \
     m##j = DISTI_ADD(m##j, a##i##j);                                                                                   \
     DISTI_TWO_STORE(y + at##j, y + to##j, a##i##j)
 #define DISTI_FEW_STORE(i, V)                                                                                          \
@@ -3662,7 +3694,7 @@ static uint32_t disti_f16_bits(float x) /* not called: dist_net_set_half refuses
     {disti_gemm_##isa, disti_gemm_some_##isa, few, few_points, parts, disti_bound_##isa, disti_live_##isa,             \
      disti_fit_##isa, disti_gemm_back_##isa, disti_gemm_weights_##isa, disti_dot_##isa, disti_outer_##isa,             \
      disti_lanes_##isa, disti_rows_##isa, disti_points_##isa, disti_angles_##isa, disti_axpy_##isa, disti_relu_##isa,  \
-     disti_activate_##isa, disti_activate_back_##isa, disti_norm_##isa, disti_norm_back_##isa,                         \
+     disti_activate_##isa, disti_activate_back_##isa, disti_norm_##isa, disti_norm_few_##isa, disti_norm_back_##isa,   \
      disti_norm_tangents_##isa, disti_activate_tangents_##isa, disti_huge_##isa, disti_transpose_##isa}
 
 /* isa: one that disti_cpu_has */
@@ -6530,11 +6562,14 @@ static int disti_net_narrowest(const dist_net *net)
     return narrow;
 }
 
+/* Whether nothing but ReLU stands between the net's layers. */
+static int disti_net_plain(const dist_net *net) { return net->activation == DIST_ACTIVATION_RELU && !net->normed; }
+
 /* Wide nets of units that can be dead and of inputs that are the point itself. */
 static int disti_net_sparse(const dist_net *net)
 {
-    return net->activation == DIST_ACTIVATION_RELU && !net->normed && net->levels == 0 && net->layers > 2 &&
-           net->max_rows <= 1100 && disti_net_narrowest(net) >= 96;
+    return disti_net_plain(net) && net->levels == 0 && net->layers > 2 && net->max_rows <= 1100 &&
+           disti_net_narrowest(net) >= 96;
 }
 
 /* The file's number of unit u of layer l; the last layer's stand as in the file. */
@@ -6595,7 +6630,7 @@ static void disti_hidden(const dist_shape *shape, disti_block *b, int l, const f
     size_t width = (size_t)net->max_rows, out = (size_t)layer->out;
     uint64_t *mask = b->mask + (size_t)(l + 1) * width;
     const float *bias = shape->bias + (size_t)(b->half ? net->layers : l) * width;
-    int plain = net->activation == DIST_ACTIVATION_RELU && !net->normed && !b->half;
+    int plain = disti_net_plain(net) && !b->half;
     if (disti_use_blas(shape, l)) {
         disti_linear_blas(shape, l, bias, DISTI_BLOCK, DISTI_BLOCK, x, x + (size_t)layer->prev * DISTI_BLOCK, y);
         if (plain) shape->kernels.relu(out, y, mask);
@@ -6890,7 +6925,7 @@ static void disti_fold_sum(const dist_shape *shape, disti_block *b, const float 
 {
     const dist_net *net = shape->net;
     size_t fold = 0, width = (size_t)net->max_rows;
-    int sparse = net->activation == DIST_ACTIVATION_RELU && !net->normed;
+    int sparse = disti_net_plain(net);
     float ones[DISTI_BLOCK];
     for (size_t c = 0; c < DISTI_BLOCK && !seed; c++) ones[c] = 1.0f;
     for (int l = 0; l < net->layers; l++) {
@@ -6921,12 +6956,12 @@ static int disti_fold_drop(const dist_shape *shape, const disti_block *b, size_t
     return 1;
 }
 
-/* Whether few points go through kernels.few. */
-static int disti_net_few(const dist_shape *shape, size_t n)
+/* Whether n points go through kernels.few: not where a reverse pass needs what LayerNorm keeps. */
+static int disti_net_few(const dist_shape *shape, const disti_block *b, size_t n)
 {
     const dist_net *net = shape->net;
-    return n <= (size_t)shape->kernels.few_points && net->activation == DIST_ACTIVATION_RELU && !net->normed &&
-           net->layers > 1 && !shape->ctx->blas.sgemm_fn;
+    return n <= (size_t)shape->kernels.few_points && (b->values || !net->normed) && net->layers > 1 &&
+           !shape->ctx->blas.sgemm_fn;
 }
 
 /* How many of the n points that are left are evaluated next, at most a block: some counts go faster as parts, one of
@@ -6935,45 +6970,88 @@ static size_t disti_net_part(const dist_shape *shape, const disti_block *b, size
 {
     const disti_part *part = shape->kernels.parts;
     size_t block = DISTI_MIN(n, (size_t)DISTI_BLOCK);
-    if (!part || !b->values || !shape->wide || !disti_net_few(shape, (size_t)shape->kernels.few_points)) return block;
+    if (!part || !b->values || !shape->wide || !disti_net_plain(shape->net) || shape->ctx->blas.sgemm_fn) return block;
     while (part->least && n > (size_t)part->most) part++;
     return part->least && n >= (size_t)part->least ? (size_t)part->points : block;
 }
 
-/* disti_net_forward of a few points: activations stand (points, max_rows), so that weights fill the vectors. The last
+/* Of few points' rows y (columns, stride) the first n numbers to (n, lanes), idle ones of DISTI_FEW_LANES repeating the
+   last point. */
+static void disti_few_turn(const dist_shape *shape, const disti_block *b, size_t n, size_t stride, const float *y,
+                           size_t lanes, float *to)
+{
+    size_t u = 0, last = (size_t)b->columns - 1;
+    const float *rows[DISTI_FEW_LANES];
+    for (size_t c = 0; c < DISTI_FEW_LANES; c++) rows[c] = y + DISTI_MIN(c, last) * stride;
+    for (; u + DISTI_BLOCK <= n; u += DISTI_BLOCK) {
+        shape->kernels.transpose(rows, 1.0f, to + u * lanes, lanes);
+        for (size_t c = 0; c < DISTI_FEW_LANES; c++) rows[c] += DISTI_BLOCK;
+    }
+    for (size_t c = 0; c < DISTI_FEW_LANES; c++)
+        for (size_t k = u; k < n; k++) to[k * lanes + c] = rows[c][k - u];
+}
+
+/* What follows few points' sums y (columns, stride) of hidden layer l where that is more than ReLU; sum tells which
+   units are alive. The slopes go where a reverse pass reads them. */
+static void disti_few_hidden(const dist_shape *shape, const disti_block *b, int l, size_t stride, float *y, float *sum)
+{
+    const dist_net *net = shape->net;
+    const disti_linear *layer = &net->layer[l];
+    size_t out = (size_t)layer->out, whole = disti_round_up(out, 16); /* vectors, as blocks have them */
+    int relu = net->activation == DIST_ACTIVATION_RELU;
+    float *turned = b->delta[1], *slope = b->values ? NULL : b->delta[1];
+    if (net->normed) {
+        disti_few_turn(shape, b, out, stride, y, DISTI_FEW_LANES, turned);
+        shape->kernels.norm_few(layer->out, b->columns, stride, net->norm_epsilon, net->params + layer->norm_weight,
+                                net->params + layer->norm_bias, turned, b->hat, y);
+    }
+    for (size_t c = 0; c < (size_t)b->columns; c++, y += stride) {
+        float scale = l == 0 ? net->first_scale : net->scale;
+        for (size_t u = out; u < whole; u++) y[u] = 0.0f;
+        shape->kernels.activate(net->activation, scale, whole, y, slope ? slope + c * stride : NULL);
+        for (size_t u = 0; u < out; u++) sum[u] = relu ? (c > 0 ? sum[u] : 0.0f) + y[u] : 1.0f;
+    }
+    if (slope)
+        disti_few_turn(shape, b, out, stride, slope, DISTI_BLOCK,
+                       b->slope + (size_t)l * (size_t)net->max_rows * DISTI_BLOCK);
+}
+
+/* disti_net_forward of a few points: activations stand (points, stride), so that weights fill the vectors. The last
    layer's input is put into rows, of which alive ones are written. With masks where a gradient is wanted. */
 static const float *disti_few_forward(const dist_shape *shape, disti_block *b, disti_counter *counter)
 {
     const dist_net *net = shape->net;
-    size_t width = (size_t)net->max_rows, points = (size_t)b->columns;
-    int last = net->layers - 1;
+    size_t width = (size_t)net->max_rows, stride = disti_round_up(width, 16), points = (size_t)b->columns;
+    int last = net->layers - 1, plain = disti_net_plain(net);
     float *sum = b->delta[0];
     double done = 0.0;
     for (int l = 0; l <= last; l++) {
         const disti_linear *layer = &net->layer[l];
-        float *x = b->act[l & 1];
+        float *x = b->act[l & 1], *y = b->act[(l + 1) & 1];
         int *list = b->alive + (size_t)l * width, count = 0;
         for (int u = 0; u < layer->prev; u++) {
             list[count] = u;
             count += !(sum[u] <= 0.0f);
         }
         b->alive_units[l] = count;
-        for (int i = 0; i < count && !b->values; i++) { /* for the way back */
+        for (int i = 0; i < count && plain && !b->values; i++) { /* for the way back */
             uint64_t *mask = b->mask + (size_t)l * width + list[i];
             *mask = 0;
-            for (size_t c = 0; c < points; c++) *mask |= (uint64_t) !(x[c * width + (size_t)list[i]] <= 0.0f) << c;
+            for (size_t c = 0; c < points; c++) *mask |= (uint64_t) !(x[c * stride + (size_t)list[i]] <= 0.0f) << c;
         }
         for (int i = 0; i < layer->point; i++, count++) {
             b->mask[(size_t)l * width + (size_t)(layer->prev + i)] = ~(uint64_t)0;
             list[count] = layer->prev + i;
-            for (size_t c = 0; c < points; c++) x[c * width + (size_t)list[count]] = b->point[i * DISTI_BLOCK + (int)c];
+            float *place = x + list[count];
+            for (size_t c = 0; c < points; c++) place[c * stride] = b->point[i * DISTI_BLOCK + (int)c];
         }
         b->alive_count[l] = count;
         done += (double)count * layer->out;
         if (l == last) break;
-        disti_few few = {net->panels + layer->panel, shape->bias + (size_t)l * width, x, list, b->act[(l + 1) & 1],
-                         sum, width, layer->prev + layer->point, count, layer->out, b->columns};
+        disti_few few = {net->panels + layer->panel, shape->bias + (size_t)l * width, x, list, y, sum, stride,
+                         layer->prev + layer->point, count, layer->out, b->columns, plain};
         shape->kernels.few(&few);
+        if (!plain) disti_few_hidden(shape, b, l, stride, y, sum);
     }
     counter->done += done * b->columns;
     const float *x = b->act[last & 1];
@@ -6981,7 +7059,7 @@ static const float *disti_few_forward(const dist_shape *shape, disti_block *b, d
     float *rows = b->act[(last & 1) ^ 1];
     for (int i = 0; i < b->alive_count[last]; i++) {
         float *row = rows + (size_t)list[i] * DISTI_BLOCK;
-        for (size_t c = 0; c < points; c++) row[c] = x[c * width + (size_t)list[i]];
+        for (size_t c = 0; c < points; c++) row[c] = x[c * stride + (size_t)list[i]];
         for (size_t c = points; c < DISTI_BLOCK; c++) row[c] = 0.0f;
     }
     return rows;
@@ -7218,8 +7296,8 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
         } else {
             count = disti_net_part(shape, block, n - at);
             disti_block_load(shape, block, count, points + 3 * at);
-            const float *x = disti_net_few(shape, count) ? disti_few_forward(shape, block, counter)
-                                                         : disti_net_forward(shape, block, NULL, counter);
+            const float *x = disti_net_few(shape, block, count) ? disti_few_forward(shape, block, counter)
+                                                                : disti_net_forward(shape, block, NULL, counter);
             disti_net_output(shape, block, x, net->sdf_channel);
         }
         if (sdf) memcpy(sdf + at, block->value, count * sizeof(float));

@@ -28,6 +28,7 @@ static const char usage[] =
     "  --model FILE       a decoder at its own surface instead of the random nets; or the word embedded\n"
     "  --code N           which of its codes (default 0)\n"
     "  --activation NAME  of the random nets: relu (default), elu, softplus, sine or tanh\n"
+    "  --points N         at a time (default 3072, with --quick 768, of scalar kernels 192, which are the most)\n"
     "  --repetitions N    of each measurement (default 9)\n"
     "  --best             the fastest of them, not the median: for a machine that others use too\n"
     "  --quick            the two extreme cases, one thread, short\n";
@@ -60,7 +61,7 @@ static const char *const activations[] = {"relu", "elu", "softplus", "sine", "ta
 
 typedef struct settings {
     const char *only_case, *only_isa, *model;
-    int code, threads, repetitions, best, quick, activation;
+    int code, threads, points, repetitions, best, quick, activation;
 } settings;
 
 /* ---- what is measured -------------------------------------------------------------------------------------------- */
@@ -316,6 +317,7 @@ static void measure_net(const settings *s, const net_case *c, int isa, int threa
     float *points = take_floats(3 * w.batch);
     if (c) { random_points(w.batch, points); }
     if (!c) { w.batch = surface_points(w.ctx, &w.field, w.batch, points); }
+    if (s->points > 0 && (size_t)s->points < w.batch) { w.batch = (size_t)s->points; }
     w.points = points;
     w.sdf = take_floats(w.batch);
     w.other_sdf = take_floats(w.batch);
@@ -374,7 +376,7 @@ static void measure_net(const settings *s, const net_case *c, int isa, int threa
 
 static settings read_options(int argc, char **argv)
 {
-    settings s = {NULL, NULL, NULL, 0, 2, 9, 0, 0, 0};
+    settings s = {NULL, NULL, NULL, 0, 2, 0, 9, 0, 0, 0};
     options o = options_begin(argc, argv, usage);
     while (option_next(&o)) {
         if (option_is(&o, "--case")) {
@@ -389,6 +391,8 @@ static settings read_options(int argc, char **argv)
             s.code = option_int(&o, 0, 1 << 30);
         } else if (option_is(&o, "--activation")) {
             s.activation = option_choice(&o, activations);
+        } else if (option_is(&o, "--points")) {
+            s.points = option_int(&o, 1, 64 * DISTI_BLOCK);
         } else if (option_is(&o, "--repetitions")) {
             s.repetitions = option_int(&o, 1, REPETITIONS_MAX);
         } else if (option_is(&o, "--best")) {

@@ -10,7 +10,7 @@
 
    How to use it:
        #define DIST_IMPLEMENTATION                                            // in one file of your program
-       #include "dist.h"
+       #include "dist.h"                                 // W, H and depth (W * H floats) below are yours
 
        dist_context *ctx    = dist_context_create(NULL);
        dist_net     *net    = dist_net_load_file(ctx, "model.safetensors");
@@ -32,16 +32,16 @@
        DIST_NO_OPENMP         ignore the compiler's OpenMP flag
        DIST_NO_STDIO          no files: memory only
        DIST_NO_LIBC_ALLOC     no malloc: dist_context_desc.allocator is required
-       DIST_NO_BACKWARD       no gradients (implies DIST_NO_TRAIN)
-       DIST_NO_TRAIN          no weight gradients, no dist_net_create, no Adam
+       DIST_NO_BACKWARD       no gradients, no Adam (implies DIST_NO_TRAIN)
+       DIST_NO_TRAIN          no weight gradients, no dist_net_create
        DIST_NO_MESH           no isosurface, no Chamfer
        DIST_NO_HALF           no 16-bit kernels: dist_net_set_half refuses
        DIST_NO_PAPER          no DIST_TRACE_PAPER
 
    Conventions: world to camera x_cam = R x + t, x right, y down, z forward; pixel centers at integers unless the camera
    says otherwise; depth is z, distance is along the ray; images are (height, width[, channels]), top row first; points
-   are (n, 3); a zeroed _desc means the defaults and NULL means the same; gradients are added to, never written;
-   what is made, loaded or read is NULL on failure.
+   are (n, 3); a zeroed _desc means the defaults and NULL means the same; what a loss sends back (d_..., dist_gradients)
+   is added to, never written; what is made, loaded or read is NULL on failure.
 
    Contents:
    @ 01 config, status, hooks   @ 02 context   @ 03 kernels   @ 04 field   @ 05 net   @ 06 camera
@@ -167,7 +167,7 @@ DIST_API void dist_context_destroy(dist_context *ctx);
 
 /* First failure since the context was made or cleared. A NULL context: DIST_BAD_ARGUMENT. */
 DIST_API dist_status dist_context_status(const dist_context *ctx);
-/* Its sentence; "" if there was none. Valid until the context is cleared or destroyed. */
+/* Its sentence; "" if there was none; of a NULL context one that says so. Valid until it is cleared or destroyed. */
 DIST_API const char *dist_context_message(const dist_context *ctx);
 /* Forgets the failure. Not that of dist_context_create: such a context goes on refusing everything. */
 DIST_API void dist_context_clear(dist_context *ctx);
@@ -189,10 +189,11 @@ typedef void (*dist_seed_fn)(void *seed_user, size_t first, size_t count, const 
    with the same worker, they may. */
 typedef struct dist_field {
     void *user;
-    /* sdf[i] = f(points[i]) for n points (n, 3), any number; gradient (n, 3) is NULL or gets df/dpoint.
+    /* sdf[i] = f(points[i]) for n points (n, 3), any number; gradient (n, 3) is NULL or is set to df/dpoint.
        Called from several workers at once; worker is 0..dist_context_workers-1. */
     void (*eval_fn)(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient);
-    /* d_code[j] += sum over i of d_sdf[i] * df(points[i])/dcode[j]. NULL: there is no code, or fused_fn is set. */
+    /* d_code[j] += sum over i of d_sdf[i] * df(points[i])/dcode[j], j < code_size. NULL: there is no code, or fused_fn
+       is set. */
     void (*adjoint_fn)(void *user, int worker, size_t n, const float *points, const float *d_sdf, double *d_code);
     /* Set by dist_shape_field, NULL in a field of your own: value, gradient and code adjoint in one pass, and the
        weights'. The adjoint_fn of a field that wraps a net's calls it, with a seed_fn that tells its d_sdf. */
@@ -363,7 +364,7 @@ DIST_API unsigned long long dist_scene_queries(const dist_scene *scene);
 
 /* ---- 05 net ------------------------------------------------------------------------------------------------------ */
 
-/* Weights of a decoder: read-only after creation, shared by any number of shapes and contexts. */
+/* Weights of a decoder, which nothing but dist_net_set_... changes, shared by any number of shapes and contexts. */
 typedef struct dist_net dist_net;
 /* Weights and one code, folded into the biases. Belongs to the context that made it. */
 typedef struct dist_shape dist_shape;
@@ -466,7 +467,7 @@ DIST_API dist_status dist_shape_set_color_code(dist_shape *shape, const float *c
    refuses. */
 DIST_API dist_field dist_shape_field(dist_shape *shape);
 /* All output channels (n, dist_net_channels) at n points, in the order of the file's dist.channels; the distance's is
-   f, so dist.level is off it. */
+   f = channel - dist.level. */
 DIST_API dist_status dist_shape_eval(dist_context *ctx, dist_shape *shape, size_t n, const float *points,
                                      float *channels);
 
@@ -554,7 +555,7 @@ typedef struct dist_render_desc {
     int no_cones;        /* 1: every ray marches from the bounding sphere by itself */
     int no_prediction;   /* 1: no ray starts from what its neighbors found */
     int certified;       /* 1: only steps that the Lipschitz figures prove, field.certified where that is larger, for
-                            three to eight times the queries, more where f stays small beside outlines; nothing is
+                            one to four times the queries of a small picture, up to ten of a large one; nothing is
                             missed, nor seen by more than epsilon too far away, where they are bounds: a net's are the
                             steepest slopes sampled, dist_stats.steepest says when these were too small */
     /* dist_trace only. any_hit 1: a ray ends as soon as anything is certain to block it, for shadows; its distance is
@@ -633,10 +634,10 @@ DIST_API dist_status dist_field_closest_point(dist_context *ctx, const dist_fiel
    bounds, but for rays that just touch the surface; a sphere of dist_field_collide asks nothing where the grid shows it
    to be clear, a small one from a cell or two off the surface on. Empty is what the field's Lipschitz figures allow no
    surface in, as for a picture's cones; pictures, whose rays help each other, do without. bench/bench_cache.c prints
-   what it saves: from a third to three quarters of the rays' queries. Belongs to the context that made it. */
+   what it saves: from a quarter to three quarters of the rays' queries. Belongs to the context that made it. */
 typedef struct dist_cache dist_cache;
-/* resolution: cells along each side of the cube around the bounding sphere, a multiple of 8 to 512; 0: 64. That many
-   bytes to the third power, and about 8 times its square of queries. NULL on failure. */
+/* resolution: cells along each side of the cube around the bounding sphere, a multiple of 8 to 512; 0: 64. Takes
+   resolution^3 bytes, and about 8 resolution^2 queries to make. NULL on failure. */
 DIST_API dist_cache *dist_cache_create(dist_context *ctx, const dist_field *field, int resolution);
 DIST_API void dist_cache_destroy(dist_cache *cache);
 /* The field with its cache, to be traced instead of it. Borrows both. As soon as the shape's code, the net's weights or
@@ -734,8 +735,8 @@ DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *ta
 
 /* Each returns weight * loss and adds its gradient to the d_ array unless that is NULL. n: pixels. Means are over the
    pixels that count; none, or a plane that is NULL: 0 and no gradient. Sums are kept in double.
-   A target counts where it is finite and 0 < target < 1e5; mask may be NULL: then every pixel is a hit. What is not
-   finite does not count: a loss does not tell that a code or a picture is spoiled. Nor does such a weight: 0. */
+   A target counts where it is finite, a depth where 0 < target < 1e5; mask may be NULL: then every pixel is a hit. What
+   is not finite does not count: a loss does not tell that a code or a picture is spoiled. Nor does such a weight: 0. */
 
 /* mean |depth - target| over hit, observed pixels. A pixel that the shape does not cover has no say, and where none is
    covered the loss is 0: dist_loss_silhouette beside it keeps the shape where it was seen. */
@@ -795,7 +796,7 @@ DIST_API float dist_loss_photometric(const dist_photo *to, const dist_photo *fro
 typedef struct dist_adam {
     float *moments;
     float rate;    /* 0: 1e-2; negative: exactly no movement */
-    float beta1;   /* 0, or not below 1: 0.9 */
+    float beta1;   /* 0 or less, or 1 or more: 0.9 */
     float beta2;   /* likewise: 0.999 */
     float epsilon; /* 0: 1e-8 */
     int step;      /* steps taken so far */
@@ -1888,7 +1889,7 @@ typedef struct disti_gemm_weights {
 } disti_gemm_weights;
 
 /* Few points: y[c][o] = bias[o] + sum_k weights(o, k) x[c][k], gemm's bits, over the rows listed in ascending order,
-   with relu no less than 0; sum[o] = that of y[.][o], 0 then only where all are. bias, y and sum are written or read up
+   with relu no less than 0; then sum[o] = that of y[.][o], 0 only where all are. bias, y and sum are written or read up
    to out rounded up to 8. */
 enum { DISTI_FEW_POINTS = 12, DISTI_FEW_LANES = 16 };
 typedef struct disti_few {
@@ -2404,7 +2405,7 @@ DISTI_INLINE void disti_norm_lanes(int units, size_t lanes, float epsilon, const
     }
 }
 
-/* Its bits (with -ffast-math to rounding) for points y (points, stride), which x has as (units, DISTI_FEW_LANES): that
+/* Its bits, with -ffast-math or x87 to rounding, for points y (points, stride), which x has as (units, FEW_LANES): that
    is what the sums go over, in the same order. */
 DISTI_INLINE void disti_norm_points(int units, int points, size_t stride, float epsilon, const float *gamma,
                                     const float *beta, const float *DISTI_RESTRICT x, float *DISTI_RESTRICT hat,
@@ -2497,6 +2498,7 @@ static void disti_relu_scalar(size_t rows, float *y, uint64_t *mask)
 
 static void disti_few_scalar(const disti_few *g)
 {
+    const int relu = g->relu;
     for (int o = 0; o < (g->out + 7) / 8 * 8; o += 8) {
         const float *weights = g->weights + (size_t)o * (size_t)g->rows, *bias = g->bias + o;
         for (int i = 0; i < 8; i++) g->sum[o + i] = 0.0f;
@@ -2505,7 +2507,7 @@ static void disti_few_scalar(const disti_few *g)
             float *y = g->y + c * g->stride + o;
 #define DISTI_BEGIN(j) float a##j = bias[j], b##j = bias[4 + j];
 #define DISTI_TERM(j) a##j += w[j] * x[k]; b##j += w[4 + j] * x[k];
-#define DISTI_END(j) y[j] = a##j; y[4 + j] = b##j;
+#define DISTI_END(j) y[j] = relu && a##j <= 0.0f ? 0.0f : a##j; y[4 + j] = relu && b##j <= 0.0f ? 0.0f : b##j;
             DISTI_FOUR(DISTI_BEGIN)
             for (int i = 0; i < g->count; i++) {
                 const size_t k = (size_t)g->list[i];
@@ -2513,11 +2515,10 @@ static void disti_few_scalar(const disti_few *g)
                 DISTI_FOUR(DISTI_TERM)
             }
             DISTI_FOUR(DISTI_END)
-            for (int i = 0; i < 8 && g->relu; i++) y[i] = y[i] <= 0.0f ? 0.0f : y[i];
 #undef DISTI_BEGIN
 #undef DISTI_TERM
 #undef DISTI_END
-            for (int i = 0; i < 8; i++) g->sum[o + i] += y[i];
+            for (int i = 0; i < 8 && relu; i++) g->sum[o + i] += y[i];
         }
     }
 }
@@ -3108,8 +3109,10 @@ DISTI_PLAIN(scalar, static)
 #define DISTI_FEW_ROW(i, V) { const DISTI_VEC b = DISTI_SET1(x##i[k]); DISTI_X##V(DISTI_FEW_MAC, i) }
 #define DISTI_FEW_STORE1(i, j)                                                                                         \
     a##i##j = DISTI_ADD(a##i##j, DISTI_TWO(g->bias + at##j, g->bias + to##j));                                         \
-    if (g->relu) a##i##j = DISTI_RELU(a##i##j);                                                                        \
-    m##j = DISTI_ADD(m##j, a##i##j);                                                                                   \
+    if (g->relu) {                                                                                                     \
+        a##i##j = DISTI_RELU(a##i##j);                                                                                 \
+        m##j = DISTI_ADD(m##j, a##i##j);                                                                               \
+    }                                                                                                                  \
     DISTI_TWO_STORE(y + at##j, y + to##j, a##i##j)
 #define DISTI_FEW_STORE(i, V)                                                                                          \
     {                                                                                                                  \
@@ -8746,7 +8749,12 @@ static dist_status disti_loader_meta(disti_loader *loader)
     net->bound = (float)disti_loader_number(loader, "dist.bound", 1e-6, 1e6, 1);
     net->point_size = (net->raw ? 3 : 0) + 6 * net->levels;
     loader->skip_scale = (float)disti_loader_number(loader, "dist.skip_scale", 1e-6, 1e6, 1);
-    if (loader->status == DIST_OK && net->point_size == 0) disti_loader_bad(loader, "dist.encoding.levels");
+    if (loader->status == DIST_OK && encoding != (levels > 0))
+        disti_loader_fail(loader, DIST_BAD_FILE,
+                          encoding ? "dist_net_load: metadata dist.encoding is %s, so its levels must be 1 to 16"
+                                   : "dist_net_load: metadata dist.encoding.levels is %s, which only fourier has",
+                          disti_archive_meta(&loader->archive, encoding ? "dist.encoding" : "dist.encoding.levels"), 0,
+                          0);
     return loader->status;
 }
 

@@ -10344,10 +10344,12 @@ static int disti_ray_backed(const disti_tracer *tracer, disti_ray *ray, disti_sa
     return disti_ray_ask(ray, DISTI_BACK, DISTI_MAX(now.s - ray->width, ray->enter));
 }
 
-/* A step of the sphere at the front alone, with ray->slope known. */
+/* A step of the sphere at the front alone, with ray->slope known; none into a solid that was found no farther on. */
 static int disti_ray_retry(const disti_tracer *tracer, disti_ray *ray)
 {
     float step = DISTI_MAX(disti_empty(tracer, ray->front.f), 4.8e-7f * tracer->field->radius);
+    if (ray->b.f < 0.0f && ray->front.s + step >= ray->b.s)
+        return disti_ray_open_bracket(tracer, ray, ray->front, ray->b);
     return disti_ray_ask(ray, DISTI_MARCH, DISTI_MIN(ray->front.s + step, ray->leave));
 }
 
@@ -10431,13 +10433,15 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
     disti_sample now = {ray->q, sample * ray->sign};
     if (!disti_finite(sample)) return disti_ray_end(ray, DIST_RAY_NOT_FINITE, now.s, 0.0f, 0.0f);
     disti_keep_least(ray, now.s, sample);
-    int spent = ++ray->steps >= tracer->how.max_steps && now.f > 0.0f;
+    int marching = ray->mode == DISTI_MARCH || ray->mode == DISTI_SKIP || ray->mode == DISTI_JUMP;
+    int spent = ++ray->steps >= tracer->how.max_steps && (marching || now.f > 0.0f);
     if (tracer->how.any_hit && now.f < 0.0f && ray->mode != DISTI_FIRST)
         return disti_ray_end(ray, DIST_RAY_HIT, now.s, now.f, now.s - ray->front.s);
     if (ray->mode == DISTI_BRACKET) {
         if (ray->steps < tracer->how.max_steps + 40) return disti_ray_bracketed(tracer, ray, now);
         return disti_ray_end(ray, DIST_RAY_HIT, 0.5f * (ray->a.s + ray->b.s), 0.0f, ray->b.s - ray->a.s);
     }
+    if (spent && now.f <= 0.0f) return disti_ray_open_bracket(tracer, ray, ray->front, now);
     if (spent && ray->mode != DISTI_BAND && ray->b.f < 0.0f && ray->b.s > ray->front.s)
         return disti_ray_open_bracket(tracer, ray, ray->front, ray->b);
     if (spent) return disti_ray_give_up(ray);

@@ -1551,6 +1551,38 @@ TEST(no_ray_steps_over_an_instance_that_is_small_beside_the_scene)
     dist_context_destroy(ctx);
 }
 
+/* A ball and a wall so far apart that a step of float's smallest reaches the solid which a larger one had found: rays
+   that touch the ball never ended (bounded by max_queries here, as nothing else did). */
+TEST(certified_rays_that_touch_a_small_ball_in_a_large_scene_end)
+{
+    const float ball[4] = {0, 0, 0, 0.03f}, wall[4] = {0, 0, -501, 500};
+    dist_context *ctx = test_context();
+    dist_field near = dist_field_sphere(ball), far = dist_field_sphere(wall);
+    dist_instance instances[2];
+    memset(instances, 0, sizeof instances);
+    instances[0].field = &near;
+    instances[1].field = &far;
+    instances[0].placement.scale = instances[1].placement.scale = 1.0f;
+    dist_scene *scene = dist_scene_create(ctx, 2, instances);
+    REQUIRE(scene != NULL);
+    dist_field field = dist_scene_field(scene);
+    dist_render_desc how;
+    memset(&how, 0, sizeof how);
+    how.certified = 1;
+    how.max_queries = 20000;
+    for (int k = -30; k < 40; k++) {
+        float origin[3] = {0.03f + 2e-5f * (float)k, 0, 3}, direction[3] = {0, 0, -1};
+        dist_hit hit;
+        dist_stats stats;
+        REQUIRE(dist_trace(ctx, &field, 1, origin, direction, &how, &hit, &stats) == DIST_OK);
+        CHECK(hit.status == DIST_RAY_HIT);
+        CHECK(fabsf(hit.distance - 3.0f) <= hit.error + 0.04f || fabsf(hit.distance - 4.0f) <= hit.error);
+        CHECK(stats.queries < 2000);
+    }
+    dist_scene_destroy(scene);
+    dist_context_destroy(ctx);
+}
+
 int main(int argc, char **argv)
 {
     test_begin(argc, argv);
@@ -1579,5 +1611,6 @@ int main(int argc, char **argv)
     RUN(a_flat_field_loses_nothing_in_a_scene);
     RUN(only_create_takes_memory_and_a_failed_one_leaves_none);
     RUN(no_ray_steps_over_an_instance_that_is_small_beside_the_scene);
+    RUN(certified_rays_that_touch_a_small_ball_in_a_large_scene_end);
     return test_report();
 }

@@ -10079,8 +10079,8 @@ static int disti_ray_doubts(const disti_tracer *tracer, const disti_ray *ray, fl
 /* Feels ahead in the band 0 < f < epsilon, farther each time; certified only as far as is proven empty. */
 static int disti_ray_feel(const disti_tracer *tracer, disti_ray *ray, float epsilon)
 {
-    float reach = DISTI_MIN(2.0f * epsilon, 0.01f * tracer->detail);
-    for (int i = 0; i < ray->side && reach < 0.01f * tracer->detail; i++) reach *= 1.5f;
+    float most = DISTI_MAX(0.01f * tracer->detail, 16.0f * epsilon), reach = 2.0f * epsilon;
+    for (int i = 0; i < ray->side && reach < most; i++) reach *= 1.5f;
     if (ray->slope < -1e-3f) reach = DISTI_MIN(1.2f * ray->front.f / -ray->slope, DISTI_MAX(reach, 64.0f * epsilon));
     reach = tracer->how.certified ? disti_empty(tracer, ray->front.f) : DISTI_MAX(reach, 0.5f * epsilon);
     float q = DISTI_MAX(ray->front.s + reach, ray->front.s + 4.8e-7f * tracer->field->radius);
@@ -11917,10 +11917,29 @@ static void disti_foot_task(void *arg, int index, int worker)
     }
 }
 
+/* Whether the caches of a scene's instances, which feet use, show what is still so. */
+static dist_status disti_foot_caches(dist_context *ctx, const dist_scene *scene, const char *function)
+{
+    dist_status status = DIST_OK;
+    unsigned char text[96];
+    disti_writer w = {text, 0};
+    disti_put_text(&w, function);
+    disti_put(&w, ": an instance", sizeof ": an instance");
+    for (int i = 0; i < scene->count && status == DIST_OK; i++) {
+        const dist_field *field = &scene->placed[i].field;
+        if (field->cache) status = disti_cache_check(ctx, field, (const char *)text);
+        if (status == DIST_OK && field->eval_fn == disti_scene_eval)
+            status = disti_foot_caches(ctx, (const dist_scene *)field->user, function);
+    }
+    return status;
+}
+
 static dist_status disti_foot_run(disti_foot_job *job, const char *function, const void *out)
 {
     dist_status status = disti_enter(job->ctx);
     if (status == DIST_OK) status = disti_field_check(job->ctx, job->field, function);
+    if (status == DIST_OK && job->field->eval_fn == disti_scene_eval)
+        status = disti_foot_caches(job->ctx, (const dist_scene *)job->field->user, function);
     if (status == DIST_OK) status = disti_count_check(job->ctx, job->n, function);
     if (status != DIST_OK) return status;
     if (job->n > 0 && (!job->points || !out))

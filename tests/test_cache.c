@@ -351,6 +351,46 @@ TEST(a_cache_of_what_has_changed_is_refused_until_it_is_made_anew)
     dist_context_destroy(ctx);
 }
 
+/* Nearest points and contacts use the caches of a scene's instances, also of one within another. */
+TEST(a_stale_cache_of_an_instance_is_refused)
+{
+    const float here[4] = {-0.5f, 0, 0, 0.2f}, there[4] = {0.5f, 0, 0, 0.2f}, sphere[4] = {-0.65f, 0.1f, 0, 0.1f};
+    dist_context *ctx = test_context();
+    dist_field a = dist_field_sphere(here), b = dist_field_sphere(there);
+    dist_cache *cache = dist_cache_create(ctx, &a, 16);
+    REQUIRE(cache != NULL);
+    dist_field with = dist_cache_field(cache);
+    dist_instance one, outer;
+    memset(&one, 0, sizeof one);
+    one.field = &with;
+    dist_scene *scene = dist_scene_create(ctx, 1, &one);
+    dist_field inner = dist_scene_field(scene);
+    outer = one;
+    outer.field = &inner;
+    dist_scene *whole = dist_scene_create(ctx, 1, &outer);
+    dist_field fields[2] = {inner, dist_scene_field(whole)};
+    for (int turn = 0; turn < 2; turn++) {
+        for (int k = 0; k < 2; k++) {
+            float closest[3], distance = 0;
+            dist_contact contact;
+            dist_context_clear(ctx);
+            dist_status status = dist_field_collide(ctx, &fields[k], 1, sphere, &contact);
+            CHECK_EQUAL(turn ? DIST_BAD_ARGUMENT : DIST_OK, status);
+            if (turn) CHECK(strstr(dist_context_message(ctx), "dist_field_collide: an instance: field.cache") != NULL);
+            else CHECK_NEAR(0.119722, contact.depth, 1e-4);
+            dist_context_clear(ctx);
+            status = dist_field_closest_point(ctx, &fields[k], 1, sphere, closest, &distance, NULL);
+            CHECK_EQUAL(turn ? DIST_BAD_ARGUMENT : DIST_OK, status);
+        }
+        dist_context_clear(ctx);
+        CHECK_STATUS(DIST_OK, dist_cache_update(cache, &b), ctx);
+    }
+    dist_scene_destroy(whole);
+    dist_scene_destroy(scene);
+    dist_cache_destroy(cache);
+    dist_context_destroy(ctx);
+}
+
 /* Whatever its figures are, also where their quotient is not exact. */
 TEST(a_cache_of_what_has_not_changed_is_taken)
 {
@@ -584,6 +624,7 @@ int main(int argc, char **argv)
     RUN(spheres_that_are_clear_of_the_surface_ask_nothing);
     RUN(pictures_are_the_same_with_and_without_a_cache);
     RUN(a_cache_of_what_has_changed_is_refused_until_it_is_made_anew);
+    RUN(a_stale_cache_of_an_instance_is_refused);
     RUN(a_cache_of_what_has_not_changed_is_taken);
     RUN(certified_rays_use_no_cache_of_smaller_figures);
     RUN(what_is_not_the_librarys_own_is_not_asked_whether_it_has_changed);

@@ -1551,6 +1551,56 @@ TEST(no_ray_steps_over_an_instance_that_is_small_beside_the_scene)
     dist_context_destroy(ctx);
 }
 
+/* Epsilon is float's noise in so large a scene, some hundredths of a small ball: rays that passed one within it ended
+   there as on a plateau, before the balls behind. */
+TEST(a_ball_that_is_grazed_hides_none_behind_it_in_a_large_scene)
+{
+    enum { BALLS = 1000, WIDE = 100, HIGH = 80, RAYS = WIDE * HIGH };
+    static dist_instance balls[BALLS + 1];
+    static unsigned char mask[RAYS];
+    const float sphere[4] = {0, 0, 0, 0.5f}, eye[3] = {0.5f, 0.6f, 3}, up[3] = {0, 1, 0};
+    dist_context *ctx = shape_context();
+    dist_field field = dist_field_sphere(sphere);
+    test_random random = test_random_seed(5);
+    memset(balls, 0, sizeof balls);
+    for (int i = 0; i <= BALLS; i++) {
+        balls[i].field = &field;
+        balls[i].placement.scale = test_random_float(&random, 0.05f, 0.15f);
+        test_random_fill(&random, 3, balls[i].placement.translation, -1.0f, 1.0f);
+    }
+    balls[BALLS].placement.scale = 1000.0f;
+    balls[BALLS].placement.translation[2] = -501.0f;
+    dist_scene *scene = dist_scene_create(ctx, BALLS + 1, balls);
+    dist_field all = dist_scene_field(scene);
+    dist_camera camera = dist_camera_look_at(WIDE, HIGH, 0.9f, eye, NULL, up);
+    dist_images out;
+    memset(&out, 0, sizeof out);
+    out.mask = mask;
+    CHECK_STATUS(DIST_OK, dist_render(ctx, &all, &camera, NULL, &out, NULL), ctx);
+    int seen = 0, lost = 0;
+    for (int i = 0; i < RAYS; i++) {
+        float origin[3], direction[3];
+        double deepest = 0.0;
+        dist_camera_ray(&camera, (float)(i % WIDE), (float)(i / WIDE), origin, direction);
+        for (int k = 0; k < BALLS; k++) {
+            double along = 0.0, square = 0.0, length = 0.0, radius = 0.5 * (double)balls[k].placement.scale;
+            for (int j = 0; j < 3; j++) {
+                double v = (double)balls[k].placement.translation[j] - (double)origin[j], d = (double)direction[j];
+                along += v * d;
+                square += v * v;
+                length += d * d;
+            }
+            deepest = fmax(deepest, 1.0 - sqrt(fmax(square - along * along / length, 0.0)) / radius);
+        }
+        seen += deepest > 0.2;
+        lost += deepest > 0.2 && !mask[i];
+    }
+    CHECK(seen > 2000);
+    CHECK_EQUAL(0, lost);
+    dist_scene_destroy(scene);
+    dist_context_destroy(ctx);
+}
+
 /* A ball and a wall so far apart that a step of float's smallest reaches the solid which a larger one had found: rays
    that touch the ball never ended (bounded by max_queries here, as nothing else did). */
 TEST(certified_rays_that_touch_a_small_ball_in_a_large_scene_end)
@@ -1611,6 +1661,7 @@ int main(int argc, char **argv)
     RUN(a_flat_field_loses_nothing_in_a_scene);
     RUN(only_create_takes_memory_and_a_failed_one_leaves_none);
     RUN(no_ray_steps_over_an_instance_that_is_small_beside_the_scene);
+    RUN(a_ball_that_is_grazed_hides_none_behind_it_in_a_large_scene);
     RUN(certified_rays_that_touch_a_small_ball_in_a_large_scene_end);
     return test_report();
 }

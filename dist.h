@@ -618,11 +618,13 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
 /* The nearest point of the surface to each of n points: steps along the gradient onto the surface, then along the
    surface as long as that brings it nearer, then a look around, through the cells of an octree (16 along each side of
    the cube around the bounding sphere) that the figures for how.certified do not show to be empty. Of a distance it is
-   as far off as the nearest to within 1e-4 of the radius; of a trained decoder mostly to within a 500th, from far away,
-   too: two parts of the surface in one cell may be taken for one. Inside the sphere a distance is asked for 2 samples a
-   point, mostly; a decoder from far away for 40 to 120 a point of some hundred in one call, which share the cells, and
-   for 200 to 2000 of a point alone. A cache spares the cells that it shows to be empty. Of a scene each instance that
-   may be nearest is gone to by itself; what is of one within another is no surface.
+   as far off as the nearest to within 1e-4 of the radius, but for one in a thousand of the points beyond the sphere
+   where parts are small (by a hundredth); of a trained decoder mostly to within a 500th, from far away, too: two parts
+   of the surface in one cell may be taken for one. Of a field clamped below a tenth of its radius the cells tell
+   little: a part that is not the nearest, or none, may be what is found. Inside the sphere a distance is asked for 2
+   samples a point, mostly; a decoder from far away for 40 to 120 a point of some hundred in one call, which share the
+   cells, and for 200 to 2000 of a point alone. A cache spares the cells that it shows to be empty. Of a scene each
+   instance that may be nearest is gone to by itself; what is of one within another is no surface.
    closest (n, 3); distance (n) signed, below 0 inside, and status (n) may be NULL: DIST_RAY_HIT, DIST_RAY_UNRESOLVED
    (no surface found: the last point tried), DIST_RAY_NOT_FINITE. Nothing is asked outside the bounding sphere. */
 DIST_API dist_status dist_field_closest_point(dist_context *ctx, const dist_field *field, size_t n,
@@ -11235,6 +11237,7 @@ DIST_API unsigned long long dist_cache_queries(const dist_cache *cache) { return
 typedef struct disti_foot_cell {
     float empty;   /* there is no surface nearer to its center */
     float seed[3]; /* the next sample; of a leaf that is `on` a place on the surface */
+    signed char normal[3]; /* there, times 127 */
     unsigned char steps, on, done, asked; /* asked: a foot has a sample under way */
 } disti_foot_cell;
 
@@ -11259,7 +11262,8 @@ typedef struct disti_foot {
     float sign;
     int cell;        /* of a look around: which is next; 0: none is under way */
     float hope[3];   /* the nearest place that was told of so far */
-    double hoped, wanted, tried; /* how much nearer that is; what is worth it; how much nearer the hope before is */
+    double hoped, wanted, tried; /* how much nearer that leads; what is worth it; how much nearer the hope before did */
+    double slide;                /* what of it is a slide's, see disti_foot_note */
     unsigned char status, steps, slides, sides; /* sides: 1 a sample was outside, 2 inside */
     unsigned char begun;  /* steps when it set out for the surface the last time */
     unsigned char landed; /* it has been on the surface since */
@@ -11459,6 +11463,7 @@ static int disti_foot_told(const dist_field *field, const disti_foot *foot, dist
     if (finite && !away) disti_foot_move(field, cell->seed, n, -step);
     for (int i = 0; i < 3; i++) away |= !(fabs((double)cell->seed[i] - center[i]) <= 4.0 * half);
     cell->on = finite && !away && size <= 0.01f * side * DISTI_MAX(slope, 0.25f);
+    for (int i = 0; i < 3 && cell->on; i++) cell->normal[i] = (signed char)(127.0f * n[i]);
     cell->done = foot->cell < DISTI_FOOT_LEAVES || (double)cell->empty >= 1.7321 * half || cell->on || away ||
                  !finite || cell->steps == DISTI_FOOT_NEWTON;
     cell->asked = !cell->done;
@@ -11475,7 +11480,7 @@ static int disti_foot_look_begin(disti_foot_tree *tree, disti_foot *foot, const 
     for (int i = 0; i < 3; i++) hope[i] = (double)foot->hope[i];
     double reach = foot->sign > 0.0f ? (double)foot->radius + leaf : 1e300, way = disti_foot_way(foot, from);
     double needed = way - reach;
-    foot->tried = foot->found ? disti_foot_gain(foot, from, way, hope) : 1e300;
+    foot->tried = foot->found ? disti_foot_gain(foot, from, way, hope) + foot->slide : 1e300;
     foot->hoped = lost ? -1e300 : DISTI_MAX(needed, 0.0);
     foot->wanted = lost ? -1e300 : DISTI_MAX(needed, 1e-3 * radius);
     foot->looks++;
@@ -11487,18 +11492,27 @@ static int disti_foot_look_begin(disti_foot_tree *tree, disti_foot *foot, const 
     return 1;
 }
 
-/* Notes the seed of a leaf if it is the nearest, but for those at what is nearest already or has been tried. */
+/* Notes the seed of a leaf if it may lead the nearest, but for those at what is nearest already or has been tried: a
+   slide along its plane, of two thirds of a leaf's half side (chosen), brings it nearer by that times the sine of the
+   angle to p. */
 static void disti_foot_note(const dist_field *field, disti_foot *foot, const double from[3], double way,
-                            const float *seed)
+                            const disti_foot_cell *cell)
 {
-    const double at[3] = {(double)seed[0], (double)seed[1], (double)seed[2]};
-    double gain = disti_foot_gain(foot, from, way, at), apart = 0.0;
-    for (int i = 0; i < 3; i++) apart = DISTI_MAX(apart, fabs(at[i] - from[i]));
-    if (!(gain > foot->hoped && gain < foot->tried)) return;
-    if (gain < foot->wanted && apart < 0.1 * (double)field->radius) return;
-    foot->hoped = gain;
+    double at[3], d[3], n[3], radius = (double)field->radius, apart = 0.0;
+    for (int i = 0; i < 3; i++) {
+        at[i] = (double)cell->seed[i];
+        d[i] = (double)foot->p[i] - at[i];
+        n[i] = (double)cell->normal[i] / 127.0;
+        apart = DISTI_MAX(apart, fabs(at[i] - from[i]));
+    }
+    double along = disti_dot(d, n), square = disti_dot(d, d), gain = disti_foot_gain(foot, from, way, at);
+    double slide = radius / 24.0 * sqrt(DISTI_MAX(1.0 - along * along / DISTI_MAX(square, 1e-300), 0.0));
+    if (gain < foot->wanted && apart < 0.13 * radius) return;
+    if (!(gain + slide > foot->hoped && gain + slide < foot->tried)) return;
+    foot->hoped = gain + slide;
+    foot->slide = slide;
     foot->found = 1;
-    memcpy(foot->hope, seed, sizeof foot->hope);
+    memcpy(foot->hope, cell->seed, sizeof foot->hope);
 }
 
 /* Goes on with a look around, or begins one. 1: a sample is wanted at x: of a cell, of what was found, or else of a
@@ -11534,7 +11548,7 @@ static int disti_foot_look(disti_foot_tree *tree, disti_foot *foot)
         }
         if ((double)cell->empty >= 1.7321 * half) continue;
         inner = foot->cell < DISTI_FOOT_LEAVES;
-        if (cell->on) disti_foot_note(field, foot, from, way, cell->seed);
+        if (cell->on) disti_foot_note(field, foot, from, way, cell);
     }
     foot->begun = foot->steps;
     if (!foot->found && foot->status == DIST_RAY_HIT)

@@ -312,7 +312,7 @@ TEST(points_find_the_nearest_instance_of_a_scene)
         CHECK_EQUAL(0, lost);
         CHECK(wrong <= (band == 0 ? 0 : 3));
         CHECK(told <= (band == 0 ? 0 : 3));
-        CHECK(band > 0 || asked <= 40.0);
+        CHECK(band > 0 || asked <= 45.0);
         if (test_state.verbose)
             printf("    %d of %d from part %d, %g to %g radii away%s: %d not found, %d wrong, %d told clear of %d; "
                    "%.1f queries a point\n", count, PARTS, first, least[band], most[band],
@@ -717,6 +717,71 @@ TEST(a_sphere_without_a_radius_is_a_point)
     CHECK_EQUAL(DIST_RAY_HIT, contacts[0].status);
     CHECK_NEAR(0.4, contacts[0].depth, 1e-5);
     CHECK_EQUAL(DIST_RAY_MISS, contacts[1].status);
+    dist_context_destroy(ctx);
+}
+
+typedef struct bubbles {
+    int n;
+    float sphere[6][4];
+} bubbles;
+
+/* The distance to the nearest of some spheres. */
+static void bubbles_eval(void *user, int worker, size_t n, const float *at, float *sdf, float *gradient)
+{
+    const bubbles *b = (const bubbles *)user;
+    (void)worker;
+    for (size_t i = 0; i < n; i++) {
+        sdf[i] = 3e38f;
+        for (int k = 0; k < b->n; k++) {
+            const float *c = b->sphere[k];
+            float d[3] = {at[3 * i] - c[0], at[3 * i + 1] - c[1], at[3 * i + 2] - c[2]};
+            float length = sqrtf(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]);
+            if (!(length - c[3] < sdf[i])) continue;
+            sdf[i] = length - c[3];
+            for (int j = 0; gradient && j < 3; j++) gradient[3 * i + (size_t)j] = d[j] / length;
+        }
+    }
+}
+
+/* From outside of the bounding sphere: where a look around finds a farther one's seed first, the nearer one's counts
+   by where a slide from its seed may lead. */
+TEST(the_nearest_of_small_parts_is_found_from_far_away)
+{
+    enum { SCENES = 100, POINTS = 100 };
+    dist_context *ctx = shape_context();
+    test_random random = test_random_seed(61);
+    int off = 0;
+    double worst = 0.0;
+    for (int scene = 0; scene < SCENES; scene++) {
+        bubbles b = {2 + scene % 5, {{0}}};
+        float at[3 * POINTS], found[3 * POINTS], way[POINTS], value[POINTS];
+        for (int k = 0; k < b.n; k++) {
+            test_random_fill(&random, 3, b.sphere[k], -0.4f, 0.4f);
+            b.sphere[k][3] = test_random_float(&random, 0.02f, 0.2f);
+        }
+        dist_field field;
+        memset(&field, 0, sizeof field);
+        field.user = &b;
+        field.eval_fn = bubbles_eval;
+        field.radius = 1.0f;
+        for (int i = 0; i < POINTS; i++) {
+            float *p = at + 3 * i, length = 0.0f;
+            while (!(length > 0.1f)) {
+                test_random_fill(&random, 3, p, -1.0f, 1.0f);
+                length = sqrtf(p[0] * p[0] + p[1] * p[1] + p[2] * p[2]);
+            }
+            for (int j = 0; j < 3; j++) p[j] *= 3.0f / length;
+        }
+        bubbles_eval(&b, 0, POINTS, at, value, NULL);
+        CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &field, POINTS, at, found, way, NULL), ctx);
+        for (int i = 0; i < POINTS; i++) {
+            worst = fmax(worst, (double)(way[i] - value[i]));
+            off += way[i] - value[i] > 1.1e-4f;
+        }
+    }
+    if (test_state.verbose) printf("    %d of %d are off, by up to %.2g\n", off, SCENES * POINTS, worst);
+    CHECK(off <= SCENES * POINTS / 500);
+    CHECK(worst < 0.02);
     dist_context_destroy(ctx);
 }
 
@@ -1182,6 +1247,7 @@ int main(int argc, char **argv)
     RUN(what_decoders_say_far_off_leads_to_the_nearest_part_all_the_same);
     RUN(closest_points_of_fields_without_an_inside_are_found);
     RUN(a_sphere_without_a_radius_is_a_point);
+    RUN(the_nearest_of_small_parts_is_found_from_far_away);
     RUN(closest_points_of_smooth_surfaces_take_a_few_queries);
     RUN(a_nearer_part_of_the_surface_is_found_by_looking_around);
     RUN(closest_points_of_thin_boards_are_found);

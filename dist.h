@@ -11508,7 +11508,8 @@ static void disti_foot_note(const dist_field *field, disti_foot *foot, const dou
     double along = disti_dot(d, n), square = disti_dot(d, d), gain = disti_foot_gain(foot, from, way, at);
     double slide = radius / 24.0 * sqrt(DISTI_MAX(1.0 - along * along / DISTI_MAX(square, 1e-300), 0.0));
     if (gain < foot->wanted && apart < 0.13 * radius) return;
-    if (!(gain + slide > foot->hoped && gain + slide < foot->tried)) return;
+    /* a little less than the last: in registers wider than a double that one is not itself */
+    if (!(gain + slide > foot->hoped && gain + slide < foot->tried - 1e-9 * radius)) return;
     foot->hoped = gain + slide;
     foot->slide = slide;
     foot->found = 1;

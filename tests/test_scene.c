@@ -1627,7 +1627,7 @@ TEST(certified_rays_that_touch_a_small_ball_in_a_large_scene_end)
         REQUIRE(dist_trace(ctx, &field, 1, origin, direction, &how, &hit, &stats) == DIST_OK);
         CHECK(hit.status == DIST_RAY_HIT);
         CHECK(fabsf(hit.distance - 3.0f) <= hit.error + 0.04f || fabsf(hit.distance - 4.0f) <= hit.error);
-        CHECK(stats.queries < 2000);
+        CHECK(stats.queries < 15000); /* some hundred; with x87 some thousand */
     }
     dist_scene_destroy(scene);
     dist_context_destroy(ctx);

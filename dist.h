@@ -555,9 +555,10 @@ typedef struct dist_render_desc {
     int no_cones;        /* 1: every ray marches from the bounding sphere by itself */
     int no_prediction;   /* 1: no ray starts from what its neighbors found */
     int certified;       /* 1: only steps that the Lipschitz figures prove, field.certified where that is larger, for
-                            one to four times the queries of a small picture, up to ten of a large one; nothing is
-                            missed, nor seen by more than epsilon too far away, where they are bounds: a net's are the
-                            steepest slopes sampled, dist_stats.steepest says when these were too small */
+                            one to four times the queries of a small picture, four to ten of a large one, more where
+                            f stays small beside outlines; nothing is missed, nor seen by more than epsilon too far
+                            away, where they are bounds: a net's are the steepest slopes sampled, dist_stats.steepest
+                            says when these were too small */
     /* dist_trace only. any_hit 1: a ray ends as soon as anything is certain to block it, for shadows; its distance is
        then that of a sample inside what blocks, its error how far before that it goes in. max_distance: how far a ray
        looks, in lengths of its direction (1: from origin to origin + direction); 0: without end */
@@ -643,7 +644,8 @@ typedef struct dist_cache dist_cache;
 DIST_API dist_cache *dist_cache_create(dist_context *ctx, const dist_field *field, int resolution);
 DIST_API void dist_cache_destroy(dist_cache *cache);
 /* The field with its cache, to be traced instead of it. Borrows both. As soon as the shape's code, the net's weights or
-   the scene have changed every call refuses it; a field of your own without changes_fn must not change. A cache serves
+   the scene have changed every call refuses it, nearest points and contacts of a scene with such an instance, too; a
+   field of your own without changes_fn must not change. A cache serves
    Lipschitz figures up to those it was made with: raise field.lipschitz, lipschitz_far before, not how.lipschitz. With
    how.certified it is used only where it was made with figures as large as field.certified and certified_far. */
 DIST_API dist_field dist_cache_field(const dist_cache *cache);
@@ -9945,13 +9947,17 @@ static float disti_ray_bent(const disti_tracer *tracer, const disti_ray *ray, di
     return b.s - a.s + a.f / ray->slope;
 }
 
+static int disti_ray_marches(const disti_ray *ray)
+{
+    return ray->mode == DISTI_MARCH || ray->mode == DISTI_SKIP || ray->mode == DISTI_JUMP;
+}
+
 /* Into the bracket [a, b], or from the nearest sample in it on, if the march had one and took it back. */
 static int disti_ray_open_bracket(const disti_tracer *tracer, disti_ray *ray, disti_sample a, disti_sample b)
 {
     disti_sample best = {ray->best, ray->fbest * ray->sign};
-    int marching = ray->mode == DISTI_MARCH || ray->mode == DISTI_SKIP || ray->mode == DISTI_JUMP;
     ray->target = disti_ray_bent(tracer, ray, a, b);
-    if (marching && best.s > a.s && best.s < b.s && best.f > 0.0f && best.f < a.f) {
+    if (disti_ray_marches(ray) && best.s > a.s && best.s < b.s && best.f > 0.0f && best.f < a.f) {
         a = best;
         ray->target = DISTI_MAX(ray->target, disti_ray_bent(tracer, ray, a, b));
     }
@@ -10078,7 +10084,8 @@ static int disti_ray_doubts(const disti_tracer *tracer, const disti_ray *ray, fl
     return ray->front.f * step < rise * (last - before);
 }
 
-/* Feels ahead in the band 0 < f < epsilon, farther each time; certified only as far as is proven empty. */
+/* Feels ahead in the band 0 < f < epsilon, farther each time: by a hundredth of the detail, or 16 epsilon if that is
+   more (beside what it grazes the band is long); certified only as far as is proven empty. */
 static int disti_ray_feel(const disti_tracer *tracer, disti_ray *ray, float epsilon)
 {
     float most = DISTI_MAX(0.01f * tracer->detail, 16.0f * epsilon), reach = 2.0f * epsilon;
@@ -10435,8 +10442,7 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
     disti_sample now = {ray->q, sample * ray->sign};
     if (!disti_finite(sample)) return disti_ray_end(ray, DIST_RAY_NOT_FINITE, now.s, 0.0f, 0.0f);
     disti_keep_least(ray, now.s, sample);
-    int marching = ray->mode == DISTI_MARCH || ray->mode == DISTI_SKIP || ray->mode == DISTI_JUMP;
-    int spent = ++ray->steps >= tracer->how.max_steps && (marching || now.f > 0.0f);
+    int spent = ++ray->steps >= tracer->how.max_steps && (now.f > 0.0f || disti_ray_marches(ray));
     if (tracer->how.any_hit && now.f < 0.0f && ray->mode != DISTI_FIRST)
         return disti_ray_end(ray, DIST_RAY_HIT, now.s, now.f, now.s - ray->front.s);
     if (ray->mode == DISTI_BRACKET) {
@@ -11463,7 +11469,8 @@ static int disti_foot_told(const dist_field *field, const disti_foot *foot, dist
     if (finite && !away) disti_foot_move(field, cell->seed, n, -step);
     for (int i = 0; i < 3; i++) away |= !(fabs((double)cell->seed[i] - center[i]) <= 4.0 * half);
     cell->on = finite && !away && size <= 0.01f * side * DISTI_MAX(slope, 0.25f);
-    for (int i = 0; i < 3 && cell->on; i++) cell->normal[i] = (signed char)(127.0f * n[i]);
+    for (int i = 0; i < 3 && cell->on; i++)
+        cell->normal[i] = (signed char)(127.0f * n[i] + (n[i] < 0.0f ? -0.5f : 0.5f));
     cell->done = foot->cell < DISTI_FOOT_LEAVES || (double)cell->empty >= 1.7321 * half || cell->on || away ||
                  !finite || cell->steps == DISTI_FOOT_NEWTON;
     cell->asked = !cell->done;
@@ -11502,11 +11509,12 @@ static void disti_foot_note(const dist_field *field, disti_foot *foot, const dou
     for (int i = 0; i < 3; i++) {
         at[i] = (double)cell->seed[i];
         d[i] = (double)foot->p[i] - at[i];
-        n[i] = (double)cell->normal[i] / 127.0;
+        n[i] = (double)cell->normal[i];
         apart = DISTI_MAX(apart, fabs(at[i] - from[i]));
     }
-    double along = disti_dot(d, n), square = disti_dot(d, d), gain = disti_foot_gain(foot, from, way, at);
-    double slide = radius / 24.0 * sqrt(DISTI_MAX(1.0 - along * along / DISTI_MAX(square, 1e-300), 0.0));
+    double along = disti_dot(d, n), squares = DISTI_MAX(disti_dot(d, d) * disti_dot(n, n), 1e-300);
+    double slide = radius / 24.0 * sqrt(DISTI_MAX(1.0 - along * along / squares, 0.0));
+    double gain = disti_foot_gain(foot, from, way, at);
     if (gain < foot->wanted && apart < 0.13 * radius) return;
     /* a little less than the last: in registers wider than a double that one is not itself */
     if (!(gain + slide > foot->hoped && gain + slide < foot->tried - 1e-9 * radius)) return;

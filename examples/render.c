@@ -14,7 +14,7 @@ static const char usage[] =
     "  --texture FILE     colors by a second net; the word embedded: the one made for the embedded model\n"
     "  --color-code WHICH which coloring: a stored one (default 0), or numbers as text or .f32\n"
     "  --planes LIST      of depth,normal,silhouette,mask,color (default depth,normal,mask and color if there is one)\n"
-    "  --trace WHICH      guarded (default), certified (proven steps alone, up to ten times the queries) or "
+    "  --trace WHICH      guarded (default), certified (proven steps alone, mostly up to ten times the queries) or "
     "paper\n"
     "  --epsilon E        largest |f| of a hit (default: the tracer's)\n"
     "  --alpha A          length of a step relative to |f| (default: the tracer's)\n"

@@ -504,8 +504,8 @@ TEST(the_order_of_units_in_memory_does_not_show)
     dist_context_destroy(ctx);
 }
 
-/* Few points go through kernels of their own, with ReLU on the way to gradients, too: the bits are those of a full
-   block. */
+/* Few points go through kernels of their own, without LayerNorm on the way to gradients, too: the bits are those of a
+   full block. */
 TEST(a_few_points_have_the_bits_of_many)
 {
     enum { MANY = 48 };

@@ -1494,6 +1494,19 @@ TEST(only_create_takes_memory_and_a_failed_one_leaves_none)
     CHECK_EQUAL(0, allocator.errors);
 }
 
+/* How far a ray's line passes a point. */
+static double ray_passes(const float *origin, const float *direction, const float *point)
+{
+    double along = 0.0, square = 0.0, length = 0.0;
+    for (int j = 0; j < 3; j++) {
+        double v = (double)point[j] - (double)origin[j], d = (double)direction[j];
+        along += v * d;
+        square += v * v;
+        length += d * d;
+    }
+    return sqrt(fmax(square - along * along / length, 0.0));
+}
+
 /* A thousand balls of a 65th of the scene's radius, smaller than its pixels: what a ray may take on trust goes by the
    smallest instance, not by the scene. The truth in double; rays that pass an edge by less than 1e-4 do not count. */
 TEST(no_ray_steps_over_an_instance_that_is_small_beside_the_scene)
@@ -1527,15 +1540,7 @@ TEST(no_ray_steps_over_an_instance_that_is_small_beside_the_scene)
     for (int i = 0; i < RAYS; i++) {
         double edge = 1.0, deepest = -1.0;
         for (int k = 0; k < BALLS; k++) {
-            double along = 0.0, square = 0.0, length = 0.0;
-            for (int j = 0; j < 3; j++) {
-                double v = (double)balls[k].placement.translation[j] - (double)origins[3 * i + j];
-                double d = (double)directions[3 * i + j];
-                along += v * d;
-                square += v * v;
-                length += d * d;
-            }
-            double deep = ball - sqrt(fmax(square - along * along / length, 0.0));
+            double deep = ball - ray_passes(origins + 3 * i, directions + 3 * i, balls[k].placement.translation);
             edge = fmin(edge, fabs(deep));
             deepest = fmax(deepest, deep);
         }
@@ -1583,14 +1588,8 @@ TEST(a_ball_that_is_grazed_hides_none_behind_it_in_a_large_scene)
         double deepest = 0.0;
         dist_camera_ray(&camera, (float)(i % WIDE), (float)(i / WIDE), origin, direction);
         for (int k = 0; k < BALLS; k++) {
-            double along = 0.0, square = 0.0, length = 0.0, radius = 0.5 * (double)balls[k].placement.scale;
-            for (int j = 0; j < 3; j++) {
-                double v = (double)balls[k].placement.translation[j] - (double)origin[j], d = (double)direction[j];
-                along += v * d;
-                square += v * v;
-                length += d * d;
-            }
-            deepest = fmax(deepest, 1.0 - sqrt(fmax(square - along * along / length, 0.0)) / radius);
+            double radius = 0.5 * (double)balls[k].placement.scale;
+            deepest = fmax(deepest, 1.0 - ray_passes(origin, direction, balls[k].placement.translation) / radius);
         }
         seen += deepest > 0.2;
         lost += deepest > 0.2 && !mask[i];

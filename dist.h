@@ -11244,12 +11244,14 @@ typedef struct disti_foot_cell {
     float empty;   /* there is no surface nearer to its center */
     float seed[3]; /* the next sample; of a leaf that is `on` a place on the surface */
     signed char normal[3]; /* there, times 127 */
-    unsigned char steps, on, done, asked; /* asked: a foot has a sample under way */
+    unsigned char steps, on, done, asked; /* asked: it is among tree->asked */
 } disti_foot_cell;
 
 typedef struct disti_foot_tree {
     const dist_field *field;
     disti_foot_cell *cells; /* cell 1: the cube around the bounding sphere; 8 k to 8 k + 7: cell k cut in eight */
+    int *asked; /* the cells whose seeds are evaluated beside the feet's next points */
+    int count, spare; /* of those; while it is less than spare, some are asked for that no foot waits for yet */
     int used;
 } disti_foot_tree;
 
@@ -11266,7 +11268,7 @@ typedef struct disti_foot {
     float from[3], drift[3]; /* of a pull: the nearest point before it, and by how much more it is to go on; of a
                                 look around: where it set out */
     float sign;
-    int cell;        /* of a look around: which is next; 0: none is under way */
+    int cell;        /* of a look around: which is waited for; 0: none is under way */
     float hope[3];   /* the nearest place that was told of so far */
     double hoped, wanted, tried; /* how much nearer that leads; what is worth it; how much nearer the hope before did */
     double slide;                /* what of it is a slide's, see disti_foot_note */
@@ -11275,14 +11277,15 @@ typedef struct disti_foot {
     unsigned char landed; /* it has been on the surface since */
     unsigned char pulled; /* the last move was a pull */
     unsigned char settled; /* no way along the surface leads nearer to p */
-    unsigned char looks, found, waits; /* looks so far; the last one found something; the sample is another foot's */
+    unsigned char looks, found; /* looks so far; the last one found something */
     unsigned char doubt;  /* of a scene: DISTI_DOUBT_* */
     int first;            /* the leaf whose sphere is nearest; clear: how near that is, then what was not gone to */
     float clear;
 } disti_foot;
 
 enum { DISTI_FEET = 512, DISTI_FOOT_STEPS = 160, DISTI_FOOT_TURN = 48, DISTI_FOOT_SLIDES = 16, DISTI_FOOT_LOOKS = 5,
-       DISTI_FOOT_LEAVES = 8 * 8 * 8 * 8, DISTI_FOOT_CELLS = 2 * DISTI_FOOT_LEAVES, DISTI_FOOT_NEWTON = 12 };
+       DISTI_FOOT_LEAVES = 8 * 8 * 8 * 8, DISTI_FOOT_CELLS = 2 * DISTI_FOOT_LEAVES, DISTI_FOOT_NEWTON = 12,
+       DISTI_FOOT_BLOCK = 32, DISTI_FOOT_AHEAD = 64 };
 
 /* Of a way to a point as far off as a float can say, whose square it cannot. */
 static float disti_foot_length(const float d[3])
@@ -11423,11 +11426,11 @@ static int disti_foot_corner(const disti_foot *foot, const double center[3])
     return corner;
 }
 
-/* On to the next cell, with its center and half its side: the part of this one that is nearest to p, or else the next
-   one that this one is a part with. */
-static int disti_foot_next(const disti_foot *foot, int inner, double center[3], double *half)
+/* On from a cell to the next one, with its center and half its side: its part that is nearest to p if `inner`, or else
+   the next one that it is a part with. */
+static int disti_foot_next(const disti_foot *foot, int cell, int inner, double center[3], double *half)
 {
-    int cell = foot->cell, turn = inner ? 0 : 8;
+    int turn = inner ? 0 : 8;
     while (turn == 8) {
         int was = cell & 7;
         if (cell <= 1) return 0;
@@ -11457,24 +11460,41 @@ static int disti_foot_promising(const dist_field *field, const disti_foot *foot,
     return disti_foot_gain(foot, x, way, to_p) > DISTI_MAX(foot->hoped, foot->wanted);
 }
 
-/* A cell's sample f with gradient n * slope at its seed. 1: another one is wanted. */
-static int disti_foot_told(const dist_field *field, const disti_foot *foot, disti_foot_cell *cell, float f,
-                           const float *n, float slope)
+/* Puts a cell among those that are evaluated next, but for one that the cache shows to be empty. */
+static void disti_foot_ask(disti_foot_tree *tree, int number, const double center[3], double half)
 {
-    double center[3], half = disti_foot_cube(field, foot->cell, center);
+    const float zero[3] = {0.0f, 0.0f, 0.0f};
+    const dist_field *field = tree->field;
+    disti_foot_cell *cell = &tree->cells[number];
+    for (int i = 0; i < 3; i++) cell->seed[i] = (float)center[i];
+    disti_foot_move(field, cell->seed, zero, 0.0f);
+    cell->empty = field->cache ? disti_cache_clear(field->cache, cell->seed) : 0.0f;
+    cell->done = (double)cell->empty >= 1.7321 * half;
+    cell->asked = !cell->done;
+    if (cell->asked) tree->asked[tree->count++] = number;
+}
+
+/* A cell's sample f with gradient g at its seed. 1: another one is wanted. */
+static int disti_foot_told(const disti_foot_tree *tree, int number, float f, const float *g)
+{
+    const dist_field *field = tree->field;
+    disti_foot_cell *cell = &tree->cells[number];
+    double center[3], half = disti_foot_cube(field, number, center);
     float size = f < 0.0f ? -f : f, lipschitz = field->lipschitz > 0.0f ? field->lipschitz : 1.0f;
-    float side = (float)half, step = DISTI_MIN(DISTI_MAX(f / DISTI_MAX(slope, 0.02f * lipschitz), -side), side);
-    int finite = disti_finite(f) && disti_finite(slope), away = !(slope > 1e-6f); /* then there is no way on */
+    float slope = disti_length(g[0], g[1], g[2]), side = (float)half;
+    float step = DISTI_MIN(DISTI_MAX(f / DISTI_MAX(slope, 0.02f * lipschitz), -side), side);
+    int finite = disti_finite(f) && disti_finite(slope), away = !finite || !(slope > 1e-6f); /* there is no way on */
+    float n[3] = {away ? 0.0f : g[0] / slope, away ? 0.0f : g[1] / slope, away ? 0.0f : g[2] / slope};
     if (cell->steps++ == 0) cell->empty = finite ? disti_certified_empty(field, size) : 3e38f;
-    if (finite && !away) disti_foot_move(field, cell->seed, n, -step);
+    if (!away) disti_foot_move(field, cell->seed, n, -step);
     for (int i = 0; i < 3; i++) away |= !(fabs((double)cell->seed[i] - center[i]) <= 4.0 * half);
-    cell->on = finite && !away && size <= 0.01f * side * DISTI_MAX(slope, 0.25f);
+    cell->on = !away && size <= 0.01f * side * DISTI_MAX(slope, 0.25f);
     for (int i = 0; i < 3 && cell->on; i++)
         cell->normal[i] = (signed char)(127.0f * n[i] + (n[i] < 0.0f ? -0.5f : 0.5f));
-    cell->done = foot->cell < DISTI_FOOT_LEAVES || (double)cell->empty >= 1.7321 * half || cell->on || away ||
-                 !finite || cell->steps == DISTI_FOOT_NEWTON;
+    cell->done = number < DISTI_FOOT_LEAVES || (double)cell->empty >= 1.7321 * half || cell->on || away ||
+                 cell->steps == DISTI_FOOT_NEWTON;
     cell->asked = !cell->done;
-    return !cell->done;
+    return cell->asked;
 }
 
 /* Begins a look around from the nearest point so far, or from the center. 0: there was enough of it. */
@@ -11524,41 +11544,35 @@ static void disti_foot_note(const dist_field *field, disti_foot *foot, const dou
     memcpy(foot->hope, cell->seed, sizeof foot->hope);
 }
 
-/* Goes on with a look around, or begins one. 1: a sample is wanted at x: of a cell, of what was found, or else of a
-   pull, or where it set out from, if it has not found the surface yet. */
+/* Goes on with a look around, or begins one, as far as the first cell that is not known yet; of those after it some
+   are asked for where there is room. 1: that one is waited for, or a sample is wanted at x: of what was found, or else
+   of a pull, or where it set out from, if it has not found the surface yet. */
 static int disti_foot_look(disti_foot_tree *tree, disti_foot *foot)
 {
     const dist_field *field = tree->field;
-    const float *at = foot->status == DIST_RAY_HIT ? foot->best : field->center, zero[3] = {0.0f, 0.0f, 0.0f};
+    const float *at = foot->status == DIST_RAY_HIT ? foot->best : field->center;
     const double from[3] = {(double)at[0], (double)at[1], (double)at[2]};
-    foot->waits = 0;
     if (foot->cell == 0 && !disti_foot_look_begin(tree, foot, from)) foot->found = 0;
     double center[3], half = disti_foot_cube(field, foot->cell, center), way = disti_foot_way(foot, from);
-    for (int inner; foot->cell > 0; foot->cell = disti_foot_next(foot, inner, center, &half)) {
-        disti_foot_cell *cell = &tree->cells[foot->cell];
+    int number = foot->cell, ahead = DISTI_FOOT_AHEAD;
+    foot->cell = 0;
+    for (int inner; number > 0; number = disti_foot_next(foot, number, inner, center, &half)) {
+        disti_foot_cell *cell = &tree->cells[number];
         double d[3] = {center[0] - from[0], center[1] - from[1], center[2] - from[2]};
+        if (foot->cell > 0 && (tree->count >= tree->spare || ahead-- == 0)) return 1;
         inner = 0;
         if (!disti_foot_promising(field, foot, from, way, center, half)) continue;
-        if (foot->cell < DISTI_FOOT_LEAVES && foot->status == DIST_RAY_HIT && disti_dot(d, d) < 3.0 * half * half) {
+        if (number < DISTI_FOOT_LEAVES && foot->status == DIST_RAY_HIT && disti_dot(d, d) < 3.0 * half * half) {
             inner = 1; /* it is not empty */
             continue;
         }
-        if (!cell->done) {
-            foot->waits = cell->asked;
-            if (foot->waits) return 1;
-            for (int i = 0; i < 3; i++) cell->seed[i] = (float)center[i];
-            disti_foot_move(field, cell->seed, zero, 0.0f);
-            cell->empty = field->cache ? disti_cache_clear(field->cache, cell->seed) : 0.0f;
-            cell->done = (double)cell->empty >= 1.7321 * half;
-            if (cell->done) continue;
-            memcpy(foot->x, cell->seed, sizeof foot->x);
-            cell->asked = 1;
-            return 1;
-        }
-        if ((double)cell->empty >= 1.7321 * half) continue;
-        inner = foot->cell < DISTI_FOOT_LEAVES;
-        if (cell->on) disti_foot_note(field, foot, from, way, cell);
+        if (!cell->done && !cell->asked) disti_foot_ask(tree, number, center, half);
+        if (!cell->done && foot->cell == 0) foot->cell = number;
+        if (!cell->done || (double)cell->empty >= 1.7321 * half) continue;
+        inner = number < DISTI_FOOT_LEAVES;
+        if (cell->on && foot->cell == 0) disti_foot_note(field, foot, from, way, cell);
     }
+    if (foot->cell > 0) return 1;
     foot->begun = foot->steps;
     if (!foot->found && foot->status == DIST_RAY_HIT)
         return !foot->settled && disti_foot_pull(field, foot, field->radius);
@@ -11597,7 +11611,7 @@ static int disti_foot_advance(disti_foot_tree *tree, disti_foot *foot, float f, 
     const dist_field *field = tree->field;
     float lipschitz = field->lipschitz > 0.0f ? field->lipschitz : 1.0f, size = f < 0.0f ? -f : f;
     float slope = disti_length(g[0], g[1], g[2]), n[3];
-    if (foot->cell == 0 && (!disti_finite(f) || !disti_finite(slope))) {
+    if (!disti_finite(f) || !disti_finite(slope)) {
         foot->status = DIST_RAY_NOT_FINITE;
         return 0;
     }
@@ -11605,12 +11619,6 @@ static int disti_foot_advance(disti_foot_tree *tree, disti_foot *foot, float f, 
     if (!(slope > 1e-6f)) { /* no direction: past the center, or any */
         float length = disti_length(n[0], n[1], n[2]);
         for (int i = 0; i < 3; i++) n[i] = length > 1e-6f * field->radius ? n[i] / length : i == 0 ? 1.0f : 0.0f;
-    }
-    if (foot->cell > 0) {
-        disti_foot_cell *cell = &tree->cells[foot->cell];
-        int more = disti_foot_told(field, foot, cell, f, n, slope);
-        memcpy(foot->x, cell->seed, sizeof foot->x);
-        return more || disti_foot_look(tree, foot);
     }
     if (foot->steps++ == 0) {
         float asked = f > 0.0f || foot->away <= 0.0f ? size : 0.0f;
@@ -11686,25 +11694,38 @@ static int disti_foot_begin(const dist_field *field, const float *p, float radiu
     return !clear_of;
 }
 
-/* Goes on until the `active` ones that bench->index lists have arrived. Returns how often f was asked. */
+/* Goes on until the `active` ones that bench->index lists have arrived. Returns how often f was asked. Where f is the
+   faster the more points it gets, cells that feet come to next go with those that they wait for: at most a block,
+   and at most DISTI_FEET points in all, as there never are more of the active ones. */
 static size_t disti_foot_rounds(const dist_field *field, int worker, const disti_bench *bench, disti_foot *feet,
                                 float *gradient, size_t active)
 {
     size_t asked = 0;
-    disti_foot_tree tree = {field, (disti_foot_cell *)(void *)(gradient + 3 * DISTI_FEET), 0};
+    disti_foot_cell *cells = (disti_foot_cell *)(void *)(gradient + 3 * DISTI_FEET);
+    disti_foot_tree tree = {field, cells, (int *)(void *)(cells + DISTI_FOOT_CELLS), 0, 0, 0};
+    int blocks = field->fused_fn == disti_shape_fused || field->many;
     while (active > 0) {
-        size_t kept = 0, asks = 0, told = 0;
+        size_t kept = 0, asks = 0, told = 0, of_cells = (size_t)tree.count;
+        for (size_t i = 0; i < of_cells; i++, asks++)
+            memcpy(bench->points + 3 * asks, cells[tree.asked[i]].seed, 3 * sizeof(float));
         for (size_t i = 0; i < active; i++) {
             const disti_foot *foot = &feet[bench->index[i]];
-            if (!foot->waits) memcpy(bench->points + 3 * asks++, foot->x, sizeof foot->x);
+            if (foot->cell == 0) memcpy(bench->points + 3 * asks++, foot->x, sizeof foot->x);
         }
         field->eval_fn(field->user, worker, asks, bench->points, bench->sdf, gradient);
+        tree.count = 0;
+        for (size_t i = 0; i < of_cells; i++, told++)
+            if (disti_foot_told(&tree, tree.asked[i], bench->sdf[told], gradient + 3 * told))
+                tree.asked[tree.count++] = tree.asked[i];
+        size_t own = asks - of_cells;
+        tree.spare = blocks && active + DISTI_FOOT_BLOCK <= DISTI_FEET && own < DISTI_FOOT_BLOCK
+                         ? DISTI_FOOT_BLOCK - (int)own : 0;
         for (size_t i = 0; i < active; i++) {
             disti_foot *foot = &feet[bench->index[i]];
             size_t k = told;
-            if (!foot->waits) told++;
-            if (foot->waits ? disti_foot_look(&tree, foot)
-                            : disti_foot_advance(&tree, foot, bench->sdf[k], gradient + 3 * k))
+            if (foot->cell == 0) told++;
+            if (foot->cell > 0 ? disti_foot_look(&tree, foot)
+                               : disti_foot_advance(&tree, foot, bench->sdf[k], gradient + 3 * k))
                 bench->index[kept++] = bench->index[i];
         }
         asked += asks;
@@ -11897,7 +11918,7 @@ static void disti_foot_task(void *arg, int index, int worker)
     disti_bench bench;
     disti_bench_init(job->ctx, worker, &bench);
     DIST_ASSERT(DISTI_FEET * (2 * sizeof(disti_foot) + 3 * sizeof(float)) +
-                DISTI_FOOT_CELLS * sizeof(disti_foot_cell) <= DISTI_REST_BYTES);
+                DISTI_FOOT_CELLS * sizeof(disti_foot_cell) + DISTI_FEET * sizeof(int) <= DISTI_REST_BYTES);
     disti_foot *feet = (disti_foot *)(void *)bench.rest, *others = feet + DISTI_FEET;
     float *gradient = (float *)(void *)(others + DISTI_FEET);
     size_t first = (size_t)index * DISTI_FEET, n = DISTI_MIN((size_t)DISTI_FEET, job->n - first), active = 0;

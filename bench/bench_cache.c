@@ -6,7 +6,8 @@
      shadow     from each of their hits toward a light, any_hit; occlusion: eight into the half space over it, half a
                 radius far
      spheres    of a fiftieth of the radius, all over the bounding sphere's cube, as dist_field_collide takes them
-   differ: rays or spheres whose status is another than without a cache. */
+     nearest    points of some of these, as dist_field_closest_point takes them, all in one call; lone: a call each
+   differ: those whose status is another than without a cache, or whose distance by more than 1e-4 of the radius. */
 #define DIST_IMPLEMENTATION
 #include "../dist.h"
 #include "../examples/common.h"
@@ -19,8 +20,8 @@ static const char usage[] =
     "  --size N           pixels along a side of the camera (default 256)\n"
     "  --quick            128 pixels, two resolutions\n";
 
-enum { RAYS, CERTIFIED, SHADOW, OCCLUSION, SPHERES, CASES, OVER = 8 };
-static const char *const names[CASES] = {"rays", "certified", "shadow", "occlusion", "spheres"};
+enum { RAYS, CERTIFIED, SHADOW, OCCLUSION, SPHERES, NEAREST, LONE, CASES, OVER = 8, NEAREST_POINTS = 4096, LONE_POINTS = 256 };
+static const char *const names[CASES] = {"rays", "certified", "shadow", "occlusion", "spheres", "nearest", "lone"};
 
 /* A field that counts what it is asked. */
 typedef struct counted {
@@ -38,7 +39,7 @@ static void counted_eval(void *user, int worker, size_t n, const float *points, 
 /* n rays or, with a radius behind each center, spheres; and what became of them without a cache. */
 typedef struct batch {
     size_t n, hits;
-    float *origins, *directions;
+    float *origins, *directions; /* of points, each on its own: (n, 3), and their distances */
     unsigned char *status;
     double seconds, queries;
 } batch;
@@ -56,12 +57,37 @@ static void batch_destroy(batch *b)
     free(b->status);
 }
 
+/* Nearest points, once; returns as batch_run does. */
+static size_t points_run(dist_context *ctx, const dist_field *field, int kind, batch *b, int first)
+{
+    size_t differ = 0, each = kind == LONE ? 1 : b->n;
+    float *closest = take_floats(3 * b->n), *distance = take_floats(b->n);
+    unsigned char *status = (unsigned char *)take(b->n, 1);
+    for (size_t i = 0; i < b->n; i += each) {
+        dist_field_closest_point(ctx, field, each, b->origins + 3 * i, closest + 3 * i, distance + i, status + i);
+    }
+    b->hits = 0;
+    for (size_t i = 0; i < b->n; i++) {
+        b->hits += status[i] == DIST_RAY_HIT;
+        if (first) {
+            b->status[i] = status[i];
+            b->directions[i] = distance[i];
+        }
+        differ += status[i] != b->status[i] || fabsf(distance[i] - b->directions[i]) > 1e-4f * field->radius;
+    }
+    free(closest);
+    free(distance);
+    free(status);
+    return differ;
+}
+
 /* Once; returns how many ended otherwise than without a cache. */
 static size_t batch_run(dist_context *ctx, const dist_field *field, int kind, batch *b, int first, dist_hit *hits,
                         dist_contact *contacts)
 {
     dist_render_desc how = {.certified = kind == CERTIFIED, .any_hit = kind == SHADOW || kind == OCCLUSION};
     size_t differ = 0;
+    if (kind >= NEAREST) { return points_run(ctx, field, kind, b, first); }
     if (kind == OCCLUSION) { how.max_distance = 0.5f * field->radius; }
     if (kind == SPHERES) {
         dist_field_collide(ctx, field, b->n, b->origins, contacts);
@@ -176,6 +202,13 @@ int main(int argc, char **argv)
     for (size_t i = 0; i < 4 * pixels; i++) {
         float at = i % 4 == 3 ? 0.02f : 2 * rng_uniform(&random) - 1;
         batches[SPHERES].origins[i] = plain.radius * at + (i % 4 == 3 ? 0.0f : plain.center[i % 4]);
+    }
+    for (int kind = NEAREST; kind < CASES; kind++) {
+        size_t most = kind == LONE ? LONE_POINTS : NEAREST_POINTS, n = most < pixels ? most : pixels;
+        batches[kind] = batch_create(n);
+        for (size_t i = 0; i < n; i++) {
+            memcpy(batches[kind].origins + 3 * i, batches[SPHERES].origins + 4 * i, 3 * sizeof(float));
+        }
     }
 
     printf("case,resolution,count,hits,make_queries,make_seconds,queries,seconds,of_queries,of_seconds,differ\n");

@@ -1231,6 +1231,60 @@ TEST(many_points_are_the_same_as_single_ones)
     dist_context_destroy(ctx);
 }
 
+static size_t calls;
+
+static void calls_counted_eval(void *user, int worker, size_t n, const float *at, float *sdf, float *gradient)
+{
+    calls++;
+    counted_eval(user, worker, n, at, sdf, gradient);
+}
+
+/* Cells that a lone point looks into next go with the one that it waits for, and nothing else changes: of a net, and of
+   a field that says that many points at once are faster. */
+TEST(a_lone_point_looks_into_several_cells_at_once)
+{
+    enum { LONE = 60 };
+    static const model_desc desc = {.name = "softplus", .code_size = 2, .activation = DIST_ACTIVATION_SOFTPLUS};
+    static float answers[3][4 * LONE];
+    size_t questions[3], visits[3];
+    dist_context *ctx = shape_context();
+    double code[MODEL_CODE] = {0.25, 0.25};
+    float codef[2] = {0.25f, 0.25f};
+    test_random random = test_random_seed(71);
+    model m = model_make(&desc, 7);
+    model_fit_ball(&m, code, 0.6);
+    dist_net *net = model_load(ctx, &m);
+    dist_shape *shape = dist_shape_create(ctx, net, codef);
+    dist_field field = dist_shape_field(shape), by_one = field;
+    by_one.user = &field;
+    by_one.eval_fn = calls_counted_eval;
+    make_points(&random, 3, 1.5f);
+    for (int k = 0; k < 3; k++) {
+        dist_field lone = by_one;
+        if (k > 0) lone.fused_fn = NULL;
+        lone.many = k == 2;
+        asked = calls = 0;
+        for (size_t i = 0; i < LONE; i++)
+            CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &lone, 1, points + 3 * i, answers[k] + 3 * i,
+                                                           answers[k] + 3 * LONE + i, NULL), ctx);
+        questions[k] = asked;
+        visits[k] = calls;
+        if (test_state.verbose)
+            printf("    %d: %lu queries, %lu calls\n", k, (unsigned long)asked, (unsigned long)calls);
+        CHECK_BYTES(sizeof answers[k], answers[0], answers[k]);
+    }
+    CHECK(questions[1] == visits[1]);
+    CHECK(3 * visits[0] < visits[1] && 3 * visits[2] < visits[1]);
+    CHECK(10 * questions[0] < 11 * questions[1] && questions[0] == questions[2]);
+    CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &field, LONE, points, closest, distance, status), ctx);
+    CHECK_BYTES(3 * LONE * sizeof(float), answers[0], closest);
+    CHECK_BYTES(LONE * sizeof(float), answers[0] + 3 * LONE, distance);
+    dist_shape_destroy(shape);
+    dist_net_destroy(net);
+    model_free(&m);
+    dist_context_destroy(ctx);
+}
+
 int main(int argc, char **argv)
 {
     test_begin(argc, argv);
@@ -1262,5 +1316,6 @@ int main(int argc, char **argv)
     RUN(no_f_leads_beyond_the_sphere);
     RUN(fields_too_far_from_0_are_refused);
     RUN(many_points_are_the_same_as_single_ones);
+    RUN(a_lone_point_looks_into_several_cells_at_once);
     return test_report();
 }

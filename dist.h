@@ -720,7 +720,7 @@ DIST_API void dist_tape_destroy(dist_tape *tape);
    The tape borrows what the field points to until its last dist_render_backward; what that is then, another code or
    other weights, must be what it was: the gradient would be neither's. No allocator call.
    Rays that miss: mask 0, depth and distance desc->background, normal 0, silhouette > 0. UNRESOLVED: mask 0, normal 0,
-   depth and distance the best so far. */
+   depth and distance the best so far. What is refused writes nothing and leaves the tape as it was. */
 DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, const dist_camera *camera,
                                  const dist_render_desc *desc, const dist_images *out, dist_tape *tape);
 
@@ -729,8 +729,8 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
    was rendered; adds to grads; with how.relax_band color also at misses: outlines move, though not those that lie
    before another surface. Of DIST_RAY_INSIDE only the silhouette counts, also where how.inside makes a hit of it; a
    silhouette beside the bounding sphere is the camera's alone, not a scene's placements'. The least |f| of a ReLU net
-   lies at a kink: the silhouette's gradient is that of one side. What is not finite in d_out counts as 0.
-   d_out->stats, if given, gets capped, backward_points and skipped added. No allocator call. */
+   lies at a kink: the silhouette's gradient is that of one side; at a hit it is that of f there. What is not finite in
+   d_out counts as 0. d_out->stats, if given, gets capped, backward_points and skipped added. No allocator call. */
 DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *tape, const dist_images *d_out,
                                           const dist_gradients *grads);
 #endif
@@ -1162,7 +1162,8 @@ struct dist_context {
     int isa;
     dist_status status;
     char message[400];
-    const char *path;       /* of the file that is being read or written, for the sentence */
+    const char *function;   /* the public one that was called last, for the sentence */
+    const char *path;       /* of the file that is being read or written, for that too */
     unsigned char *scratch; /* workers * DISTI_SCRATCH_BYTES: counters, then the tracer's part */
     unsigned char *lanes;   /* workers * lane_bytes: the field's part; grown by create functions only */
     size_t lane_bytes;      /* of each worker, a multiple of DISTI_ALIGNMENT */
@@ -1357,11 +1358,12 @@ static void *disti_alloc(dist_context *ctx, size_t bytes)
 {
     if (bytes == 0) bytes = DISTI_ALIGNMENT;
     void *p = bytes == (size_t)-1 ? NULL : ctx->allocator.alloc_fn(ctx->allocator.user, bytes, DISTI_ALIGNMENT);
-    if (!p) disti_fail(ctx, DIST_OUT_OF_MEMORY, "out of memory: %d bytes were asked for", NULL, (double)bytes, 0);
+    if (!p) disti_fail(ctx, DIST_OUT_OF_MEMORY, "%s: out of memory: %d bytes were asked for", ctx->function,
+                       (double)bytes, 0);
     if (disti_is_aligned(p)) return p;
     ctx->allocator.free_fn(ctx->allocator.user, p, bytes);
-    disti_fail(ctx, DIST_OUT_OF_MEMORY, "allocator.alloc_fn gave %d bytes that are not aligned to %d", NULL,
-               (double)bytes, DISTI_ALIGNMENT);
+    disti_fail(ctx, DIST_OUT_OF_MEMORY, "%s: allocator.alloc_fn gave %d bytes that are not aligned to %d",
+               ctx->function, (double)bytes, DISTI_ALIGNMENT);
     return NULL;
 }
 
@@ -1566,10 +1568,11 @@ static int disti_default_workers(void)
     return team;
 }
 
-/* At the door of every public function that takes a context. A context that could not be made refuses everything. */
-static dist_status disti_enter(const dist_context *ctx)
+/* At the door of every public function that may allocate. A context that could not be made refuses everything. */
+static dist_status disti_enter(dist_context *ctx, const char *function)
 {
     if (!ctx) return DIST_BAD_ARGUMENT;
+    ctx->function = function;
     return ctx->workers > 0 ? DIST_OK : ctx->status;
 }
 
@@ -1752,6 +1755,7 @@ static dist_status disti_context_begin(dist_context *ctx, const dist_context_des
     memset(ctx, 0, sizeof *ctx);
     ctx->allocator = *allocator;
     ctx->logger = desc->logger;
+    ctx->function = "dist_context_create";
     dist_status status = disti_context_check(ctx, desc);
     if (status != DIST_OK) return status;
     ctx->scheduler = desc->scheduler;
@@ -4254,7 +4258,7 @@ static void disti_field_eval_all(dist_context *ctx, const dist_field *field, siz
 DIST_API dist_status dist_field_eval(dist_context *ctx, const dist_field *field, size_t n, const float *points,
                                      float *sdf, float *gradient)
 {
-    dist_status status = disti_enter(ctx);
+    dist_status status = disti_enter(ctx, "dist_field_eval");
     if (status == DIST_OK) status = disti_field_check(ctx, field, "dist_field_eval");
     if (status == DIST_OK) status = disti_count_check(ctx, n, "dist_field_eval");
     if (status != DIST_OK || n == 0) return status;
@@ -4309,7 +4313,7 @@ static dist_status disti_color_check(dist_context *ctx, const dist_field *field,
 DIST_API dist_status dist_color_eval(dist_context *ctx, const dist_field *field, size_t n, const float *points,
                                      float *color)
 {
-    dist_status status = disti_enter(ctx);
+    dist_status status = disti_enter(ctx, "dist_color_eval");
     if (status == DIST_OK) status = disti_color_check(ctx, field, 0, "dist_color_eval");
     if (status == DIST_OK) status = disti_count_check(ctx, n, "dist_color_eval");
     if (status != DIST_OK || n == 0) return status;
@@ -4560,7 +4564,7 @@ DIST_API dist_status dist_color_backward(dist_context *ctx, const dist_field *fi
 {
     const char *name = "dist_color_backward";
     dist_gradients mine;
-    dist_status status = disti_enter(ctx);
+    dist_status status = disti_enter(ctx, name);
     if (status == DIST_OK) status = disti_color_check(ctx, field, 1, name);
     if (status == DIST_OK) status = disti_count_check(ctx, n, name);
     if (status == DIST_OK && !grads) status = disti_refuse(ctx, "%s: grads is NULL", name);
@@ -4603,7 +4607,7 @@ static dist_status disti_field_backward(dist_context *ctx, const char *name, con
                                         const float *points, float *d_sdf, dist_seed_fn seed_fn, void *seed_user,
                                         float *d_points, const dist_gradients *grads)
 {
-    dist_status status = disti_enter(ctx);
+    dist_status status = disti_enter(ctx, name);
     if (status == DIST_OK) status = disti_field_check(ctx, field, name);
     if (status == DIST_OK) status = disti_count_check(ctx, n, name);
     if (status == DIST_OK) status = disti_gradients_plain(ctx, field, grads, name);
@@ -4638,7 +4642,7 @@ DIST_API dist_status dist_field_eikonal(dist_context *ctx, const dist_field *fie
 {
     const char *name = "dist_field_eikonal";
     double *d_code = NULL, sum = 0.0;
-    dist_status status = disti_enter(ctx);
+    dist_status status = disti_enter(ctx, name);
     if (status == DIST_OK) status = disti_field_check(ctx, field, name);
     if (status == DIST_OK) status = disti_count_check(ctx, n, name);
     if (status == DIST_OK && grads) status = disti_gradients_plain(ctx, field, grads, name);
@@ -5322,13 +5326,13 @@ static dist_status disti_scene_take(dist_scene *scene)
 DIST_API dist_scene *dist_scene_create(dist_context *ctx, int count, const dist_instance *instances)
 {
     const char *name = "dist_scene_create";
-    if (disti_enter(ctx) != DIST_OK) return NULL;
-    if (!instances) {
-        disti_refuse(ctx, "%s: instances is NULL", name);
-        return NULL;
-    }
+    if (disti_enter(ctx, name) != DIST_OK) return NULL;
     if (count < 1 || count > 1 << 20) {
         disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: count is %d, must be 1 to 1048576", name, count, 0);
+        return NULL;
+    }
+    if (!instances) {
+        disti_refuse(ctx, "%s: instances is NULL", name);
         return NULL;
     }
     dist_scene *scene = (dist_scene *)disti_alloc(ctx, sizeof(dist_scene));
@@ -8222,7 +8226,7 @@ static dist_status disti_shape_take(dist_shape *shape)
 
 DIST_API dist_shape *dist_shape_create(dist_context *ctx, const dist_net *net, const float *code)
 {
-    if (disti_enter(ctx) != DIST_OK) return NULL;
+    if (disti_enter(ctx, "dist_shape_create") != DIST_OK) return NULL;
     if (!net) {
         disti_refuse(ctx, "dist_shape_create: net is NULL", NULL);
         return NULL;
@@ -8264,7 +8268,7 @@ DIST_API dist_status dist_shape_set_texture(dist_shape *shape, const dist_net *t
     if (!shape) return DIST_BAD_ARGUMENT;
     dist_context *ctx = shape->ctx;
     dist_shape *paint = NULL;
-    dist_status status = disti_enter(ctx);
+    dist_status status = disti_enter(ctx, name);
     if (status == DIST_OK && texture) status = disti_texture_check(ctx, shape->net, texture);
     if (status != DIST_OK) return status;
     if (texture) {
@@ -8304,7 +8308,7 @@ static void disti_channels_task(void *arg, int index, int worker)
 DIST_API dist_status dist_shape_eval(dist_context *ctx, dist_shape *shape, size_t n, const float *points,
                                      float *channels)
 {
-    dist_status status = disti_enter(ctx);
+    dist_status status = disti_enter(ctx, "dist_shape_eval");
     if (status != DIST_OK) return status;
     if (!shape) return disti_refuse(ctx, "dist_shape_eval: shape is NULL", NULL);
     if (shape->ctx != ctx) return disti_refuse(ctx, "dist_shape_eval: shape belongs to another context", NULL);
@@ -8538,7 +8542,7 @@ static void disti_net_sort(const dist_context *ctx, dist_net *net)
 DIST_API dist_status dist_net_set_half(dist_context *ctx, dist_net *net, int kind)
 {
     const char *name = "dist_net_set_half";
-    dist_status status = disti_enter(ctx);
+    dist_status status = disti_enter(ctx, name);
     if (status != DIST_OK) return status;
     if (!net) return disti_refuse(ctx, "%s: net is NULL", name);
     if (kind < DIST_HALF_OFF || kind > DIST_HALF_BF16)
@@ -8952,7 +8956,7 @@ static dist_status disti_loader_arrange(disti_loader *loader)
 DIST_API dist_net *dist_net_load(dist_context *ctx, const void *bytes, size_t size)
 {
     disti_loader loader;
-    if (disti_enter(ctx) != DIST_OK) return NULL;
+    if (disti_enter(ctx, "dist_net_load") != DIST_OK) return NULL;
     if (disti_loader_open(&loader, ctx, bytes, size) != DIST_OK) return NULL;
     loader.net = disti_net_new(ctx);
     int good = loader.net && disti_loader_arrange(&loader) == DIST_OK && disti_loader_values(&loader) == DIST_OK;
@@ -9069,7 +9073,7 @@ DIST_API dist_status dist_net_save(dist_context *ctx, const dist_net *net, void 
     unsigned char names[MOST][16];
     disti_saver saver;
     size_t count = 0;
-    dist_status status = disti_enter(ctx);
+    dist_status status = disti_enter(ctx, "dist_net_save");
     if (status != DIST_OK) return status;
     if (!net || !size) return disti_refuse(ctx, "dist_net_save: %s is NULL", net ? "size" : "net");
     memset(tensors, 0, sizeof tensors);
@@ -9144,7 +9148,7 @@ static dist_status disti_file_write(dist_context *ctx, const char *function, con
 DIST_API dist_net *dist_net_load_file(dist_context *ctx, const char *path)
 {
     size_t size;
-    if (disti_enter(ctx) != DIST_OK) return NULL;
+    if (disti_enter(ctx, "dist_net_load_file") != DIST_OK) return NULL;
     unsigned char *bytes = disti_file_read(ctx, "dist_net_load_file", path, &size);
     ctx->path = path;
     dist_net *net = bytes ? dist_net_load(ctx, bytes, size) : NULL;
@@ -9282,7 +9286,7 @@ DIST_API dist_net *dist_net_create(dist_context *ctx, const dist_net_desc *desc)
 {
     dist_net_desc d;
     int skip[DISTI_MAX_LAYERS];
-    if (disti_enter(ctx) != DIST_OK) return NULL;
+    if (disti_enter(ctx, "dist_net_create") != DIST_OK) return NULL;
     memset(&d, 0, sizeof d);
     if (desc) d = *desc;
     if (d.layers == 0) d.layers = 8;
@@ -9330,7 +9334,7 @@ DIST_API dist_net *dist_net_create(dist_context *ctx, const dist_net_desc *desc)
 
 DIST_API dist_status dist_net_set_weights(dist_context *ctx, dist_net *net, const float *weights)
 {
-    dist_status status = disti_enter(ctx);
+    dist_status status = disti_enter(ctx, "dist_net_set_weights");
     if (status != DIST_OK) return status;
     if (!net || !weights) return disti_refuse(ctx, "dist_net_set_weights: %s is NULL", net ? "weights" : "net");
     for (size_t i = 0; i < net->param_count; i++)
@@ -9345,7 +9349,7 @@ DIST_API dist_status dist_net_set_weights(dist_context *ctx, dist_net *net, cons
 
 DIST_API dist_status dist_net_set_code(dist_context *ctx, dist_net *net, int index, const float *code)
 {
-    dist_status status = disti_enter(ctx);
+    dist_status status = disti_enter(ctx, "dist_net_set_code");
     if (status != DIST_OK) return status;
     if (!net || !code) return disti_refuse(ctx, "dist_net_set_code: %s is NULL", net ? "code" : "net");
     if (net->code_count == 0) return disti_refuse(ctx, "dist_net_set_code: the net stores no codes", NULL);
@@ -11030,7 +11034,7 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
                                 const float *directions, const dist_render_desc *how, dist_hit *hits, dist_stats *stats)
 {
     disti_tracer tracer;
-    dist_status status = disti_enter(ctx);
+    dist_status status = disti_enter(ctx, "dist_trace");
     if (status == DIST_OK) status = disti_field_check(ctx, field, "dist_trace");
     if (status == DIST_OK) status = disti_count_check(ctx, n, "dist_trace");
     if (status == DIST_OK) status = disti_tracer_init(&tracer, ctx, field, how, "dist_trace");
@@ -11193,7 +11197,7 @@ static dist_status disti_cache_take(dist_context *ctx, int resolution, const cha
 DIST_API dist_cache *dist_cache_create(dist_context *ctx, const dist_field *field, int resolution)
 {
     const char *name = "dist_cache_create";
-    if (disti_enter(ctx) != DIST_OK) return NULL;
+    if (disti_enter(ctx, name) != DIST_OK) return NULL;
     dist_cache *cache = (dist_cache *)disti_alloc(ctx, sizeof *cache);
     if (!cache) return NULL;
     dist_status status = disti_cache_take(
@@ -11215,7 +11219,7 @@ DIST_API void dist_cache_destroy(dist_cache *cache)
 DIST_API dist_status dist_cache_update(dist_cache *cache, const dist_field *field)
 {
     if (!cache) return DIST_BAD_ARGUMENT;
-    dist_status status = disti_enter(cache->ctx);
+    dist_status status = disti_enter(cache->ctx, "dist_cache_update");
     return status == DIST_OK ? disti_cache_make(cache, field, "dist_cache_update") : status;
 }
 
@@ -11980,7 +11984,7 @@ static dist_status disti_foot_caches(dist_context *ctx, const dist_scene *scene,
 
 static dist_status disti_foot_run(disti_foot_job *job, const char *function, const void *out)
 {
-    dist_status status = disti_enter(job->ctx);
+    dist_status status = disti_enter(job->ctx, function);
     if (status == DIST_OK) status = disti_field_check(job->ctx, job->field, function);
     if (status == DIST_OK && job->field->eval_fn == disti_scene_eval)
         status = disti_foot_caches(job->ctx, (const dist_scene *)job->field->user, function);
@@ -13525,7 +13529,7 @@ static dist_status disti_tape_check(dist_context *ctx, const dist_camera *camera
 
 DIST_API dist_tape *dist_tape_create(dist_context *ctx, const dist_camera *camera, const dist_render_desc *desc)
 {
-    if (disti_enter(ctx) != DIST_OK || disti_tape_check(ctx, camera, desc) != DIST_OK) return NULL;
+    if (disti_enter(ctx, "dist_tape_create") != DIST_OK || disti_tape_check(ctx, camera, desc) != DIST_OK) return NULL;
     dist_tape *tape = (dist_tape *)disti_alloc(ctx, sizeof(dist_tape));
     if (!tape) return NULL;
     if (disti_tape_take(ctx, tape, camera, desc) != DIST_OK) {
@@ -15093,7 +15097,7 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     disti_tracer tracer;
     disti_view view;
     disti_render_job job;
-    dist_status status = disti_enter(ctx);
+    dist_status status = disti_enter(ctx, name);
     if (status == DIST_OK) status = disti_field_check(ctx, field, name);
     if (status == DIST_OK) status = disti_camera_check(ctx, camera, name);
     if (status == DIST_OK) status = disti_tracer_init(&tracer, ctx, field, desc, name);
@@ -15597,7 +15601,7 @@ DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *ta
 {
     const char *name = "dist_render_backward";
     disti_render_backward_job job;
-    dist_status status = disti_enter(ctx);
+    dist_status status = disti_enter(ctx, name);
     if (status != DIST_OK) return status;
     if (!tape || !tape->rendered)
         return disti_refuse(ctx, "dist_render_backward: tape is %s; it must have been filled by dist_render",
@@ -16161,7 +16165,7 @@ static int disti_mesh_check(dist_context *ctx, const dist_mesh *mesh, dist_statu
 DIST_API dist_mesh *dist_mesh_create(dist_context *ctx, size_t vertex_count, const float *vertices,
                                      size_t triangle_count, const unsigned *triangles)
 {
-    if (disti_enter(ctx) != DIST_OK) return NULL;
+    if (disti_enter(ctx, "dist_mesh_create") != DIST_OK) return NULL;
     if (!disti_mesh_arrays(ctx, "dist_mesh_create", vertex_count, vertices, triangle_count, triangles)) return NULL;
     if (vertex_count > 0xfffffffeu || triangle_count > (size_t)-1 / (3 * sizeof(unsigned))) {
         disti_fail(ctx, DIST_BAD_ARGUMENT, "dist_mesh_create: %d vertices and %d triangles are more than there can be",
@@ -16528,7 +16532,8 @@ DIST_API dist_mesh *dist_mesh_extract(dist_context *ctx, const dist_field *field
     disti_extract x;
     disti_case cases[256];
     dist_mesh_desc d;
-    if (disti_enter(ctx) != DIST_OK || disti_extract_check(ctx, field, desc) != DIST_OK) return NULL;
+    if (disti_enter(ctx, "dist_mesh_extract") != DIST_OK) return NULL;
+    if (disti_extract_check(ctx, field, desc) != DIST_OK) return NULL;
     memset(&d, 0, sizeof d);
     if (desc) d = *desc;
     memset(&x, 0, sizeof x);
@@ -16584,7 +16589,7 @@ DIST_API dist_status dist_mesh_backward(dist_context *ctx, const dist_field *fie
     enum { CHUNK = 4096 };
     const char *name = "dist_mesh_backward";
     float d_sdf[CHUNK];
-    dist_status status = disti_enter(ctx);
+    dist_status status = disti_enter(ctx, name);
     if (status != DIST_OK) return status;
     if (!mesh || (mesh->vertex_count && !d_vertices))
         return disti_refuse(ctx, "dist_mesh_backward: %s is NULL", mesh ? "d_vertices" : "mesh");
@@ -16638,7 +16643,7 @@ DIST_API dist_status dist_mesh_sample(dist_context *ctx, const dist_mesh *mesh, 
     size_t bytes, count = mesh ? mesh->triangle_count : 0;
     uint64_t random = seed;
     double sum = 0.0;
-    dist_status status = disti_enter(ctx);
+    dist_status status = disti_enter(ctx, name);
     if (status != DIST_OK) return status;
     status = disti_count_check(ctx, n, name);
     if (status != DIST_OK) return status;
@@ -16840,7 +16845,7 @@ DIST_API dist_status dist_chamfer(dist_context *ctx, size_t n, const float *a, s
 {
     disti_tree trees[2];
     double parts[2];
-    dist_status status = disti_enter(ctx);
+    dist_status status = disti_enter(ctx, "dist_chamfer");
     if (status == DIST_OK) status = disti_chamfer_check(ctx, n, a, "a");
     if (status == DIST_OK) status = disti_chamfer_check(ctx, m, b, "b");
     if (status != DIST_OK) return status;
@@ -16917,7 +16922,7 @@ DIST_API dist_status dist_pfm_write(dist_context *ctx, int width, int height, in
     size_t floats = 0;
     unsigned char header[64];
     disti_writer sink = {header, 0};
-    dist_status status = disti_enter(ctx);
+    dist_status status = disti_enter(ctx, name);
     if (status != DIST_OK) return status;
     if (width < 1 || height < 1)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: the picture is %d x %d, must be at least 1 x 1", name, width,
@@ -17012,7 +17017,7 @@ DIST_API dist_status dist_pfm_read(dist_context *ctx, const void *bytes, size_t 
                                    int *channels, float *pixels, size_t capacity)
 {
     disti_pfm pfm;
-    dist_status status = disti_enter(ctx);
+    dist_status status = disti_enter(ctx, "dist_pfm_read");
     if (status != DIST_OK) return status;
     if (!bytes || !width || !height || !channels)
         return disti_refuse(ctx, "dist_pfm_read: %s is NULL", bytes ? "width, height or channels" : "bytes");
@@ -17047,7 +17052,7 @@ DIST_API float *dist_pfm_load(dist_context *ctx, const char *path, int *width, i
     disti_pfm pfm;
     float *pixels = NULL;
     size_t size = 0;
-    if (disti_enter(ctx) != DIST_OK) return NULL;
+    if (disti_enter(ctx, name) != DIST_OK) return NULL;
     if (!path || !width || !height || !channels) {
         disti_refuse(ctx, "%s: path, width, height or channels is NULL", name);
         return NULL;
@@ -17454,7 +17459,7 @@ static dist_mesh *disti_mesh_parse(dist_context *ctx, const char *label, const v
 
 DIST_API dist_mesh *dist_mesh_read(dist_context *ctx, const void *bytes, size_t size)
 {
-    if (disti_enter(ctx) != DIST_OK) return NULL;
+    if (disti_enter(ctx, "dist_mesh_read") != DIST_OK) return NULL;
     if (bytes) return disti_mesh_parse(ctx, "in memory", bytes, size);
     disti_refuse(ctx, "dist_mesh_read: bytes is NULL", NULL);
     return NULL;
@@ -17525,7 +17530,7 @@ DIST_API dist_status dist_mesh_write(dist_context *ctx, const dist_mesh *mesh, i
 {
     const char *name = "dist_mesh_write";
     disti_writer sink = {NULL, 0};
-    dist_status status = disti_enter(ctx);
+    dist_status status = disti_enter(ctx, name);
     if (status != DIST_OK) return status;
     if (!mesh || !size) return disti_refuse(ctx, "dist_mesh_write: %s is NULL", mesh ? "size" : "mesh");
     if (format != DIST_MESH_PLY && format != DIST_MESH_OBJ)
@@ -17554,7 +17559,7 @@ DIST_API dist_status dist_mesh_write(dist_context *ctx, const dist_mesh *mesh, i
 DIST_API dist_mesh *dist_mesh_load(dist_context *ctx, const char *path)
 {
     size_t size;
-    if (disti_enter(ctx) != DIST_OK) return NULL;
+    if (disti_enter(ctx, "dist_mesh_load") != DIST_OK) return NULL;
     unsigned char *bytes = disti_file_read(ctx, "dist_mesh_load", path, &size);
     dist_mesh *mesh = bytes ? disti_mesh_parse(ctx, path, bytes, size) : NULL;
     disti_free(ctx, bytes, size);
@@ -17564,12 +17569,12 @@ DIST_API dist_mesh *dist_mesh_load(dist_context *ctx, const char *path)
 DIST_API dist_status dist_mesh_save(dist_context *ctx, const dist_mesh *mesh, const char *path)
 {
     size_t size = 0, n = path ? strlen(path) : 0;
-    dist_status status = disti_enter(ctx);
+    dist_status status = disti_enter(ctx, "dist_mesh_save");
     if (status != DIST_OK) return status;
     if (!mesh || !path) return disti_refuse(ctx, "dist_mesh_save: %s is NULL", mesh ? "path" : "mesh");
     int ply = n >= 4 && (memcmp(path + n - 4, ".ply", 4) == 0 || memcmp(path + n - 4, ".PLY", 4) == 0);
     int obj = n >= 4 && (memcmp(path + n - 4, ".obj", 4) == 0 || memcmp(path + n - 4, ".OBJ", 4) == 0);
-    if (!ply && !obj) return disti_refuse(ctx, "dist_mesh_save: %s: must end in .ply or .obj", path);
+    if (!ply && !obj) return disti_refuse(ctx, "dist_mesh_save: path is '%s', must end in .ply or .obj", path);
     int format = ply ? DIST_MESH_PLY : DIST_MESH_OBJ;
     status = dist_mesh_write(ctx, mesh, format, NULL, 0, &size);
     if (status != DIST_OK) return status;
@@ -17689,6 +17694,7 @@ DIST_API size_t dist_workspace_bytes(const dist_workspace_desc *desc)
     }
     disti_measure_alloc(&m, sizeof ctx, DISTI_ALIGNMENT);
     dist_status status = disti_context_begin(&ctx, &context, &counting);
+    ctx.function = name;
     if (status == DIST_OK && d.model) status = disti_measure_net(&ctx, &m, d.model, d.model_size, &net);
     if (status == DIST_OK && d.texture) status = disti_measure_net(&ctx, &m, d.texture, d.texture_size, &texture);
     if (status != DIST_OK) return 0;

@@ -139,7 +139,8 @@ static int whole_life(test_allocator *allocator, const dist_context_desc *desc, 
     }
     if (failed) {
         CHECK_STATUS(DIST_OUT_OF_MEMORY, dist_context_status(ctx), ctx);
-        CHECK_TEXT("out of memory", dist_context_message(ctx));
+        CHECK_TEXT(": out of memory", dist_context_message(ctx));
+        CHECK(memcmp(dist_context_message(ctx), "dist_", 5) == 0);
     } else {
         CHECK_STATUS(DIST_OK, dist_context_status(ctx), ctx);
     }

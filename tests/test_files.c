@@ -579,6 +579,9 @@ TEST(meshes_are_saved_by_their_ending_and_loaded)
     }
     CHECK_STATUS(DIST_BAD_ARGUMENT, dist_mesh_save(ctx, mesh, test_temp_path("test_files.stl")), ctx);
     CHECK_STATUS(DIST_BAD_ARGUMENT, dist_mesh_save(ctx, mesh, "ly"), ctx);
+    dist_context_clear(ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_mesh_save(ctx, mesh, ""), ctx);
+    CHECK_TEXT("dist_mesh_save: path is '', must end in .ply or .obj", dist_context_message(ctx));
     CHECK_STATUS(DIST_BAD_ARGUMENT, dist_mesh_save(ctx, mesh, NULL), ctx);
     CHECK_STATUS(DIST_IO, dist_mesh_save(ctx, mesh, "/no such folder/a.ply"), ctx);
     dist_mesh_destroy(mesh);

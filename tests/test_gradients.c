@@ -1713,6 +1713,52 @@ TEST(what_backward_cannot_do_is_refused)
     scene_close(&s);
 }
 
+TEST(a_refused_render_leaves_its_planes_and_tape_alone)
+{
+    scene s;
+    dist_render_desc how = implicit_how();
+    static pictures a, before;
+    float w[PIXELS];
+    dist_images d_out, out;
+    dist_stats stats;
+    result kept, got;
+    scene_analytic(&s, SPHERE);
+    dist_tape *tape = pictures_take(&a, &s, &how);
+    before = a;
+    memset(&d_out, 0, sizeof d_out);
+    for (int i = 0; i < PIXELS; i++) w[i] = 1.0f / (float)(i + 1);
+    d_out.depth = w;
+    result_begin(&kept, &s);
+    result_begin(&got, &s);
+    CHECK_STATUS(DIST_OK, dist_render_backward(s.ctx, tape, &d_out, &kept.grads), s.ctx);
+    memset(&out, 0, sizeof out);
+    memset(&stats, 7, sizeof stats);
+    out.depth = a.depth;
+    out.mask = a.mask;
+    out.silhouette = a.silhouette;
+    out.stats = &stats;
+    for (int k = 0; k < 5; k++) {
+        dist_field field = s.field;
+        dist_camera camera = s.camera;
+        dist_render_desc bad = how;
+        if (k == 0) field.radius = -1.0f;
+        if (k == 1) camera.translation[1] = (float)NAN;
+        if (k == 2) camera.width++;
+        if (k == 3) bad.warm_start = 1;
+        if (k == 4) bad.samples = 9;
+        CHECK(dist_render(s.ctx, &field, &camera, &bad, &out, tape) < 0);
+    }
+    CHECK_BYTES(sizeof a, &before, &a);
+    for (size_t i = 0; i < sizeof stats; i++) CHECK(((const unsigned char *)&stats)[i] == 7);
+    CHECK_STATUS(DIST_OK, dist_render_backward(s.ctx, tape, &d_out, &got.grads), s.ctx);
+    for (int group = 0; group < GROUPS; group++)
+        CHECK_BYTES((size_t)slots(&s, group) * sizeof(float), result_group(&kept, group), result_group(&got, group));
+    free(kept.weights);
+    free(got.weights);
+    dist_tape_destroy(tape);
+    scene_close(&s);
+}
+
 /* ---- workers ----------------------------------------------------------------------------------------------------- */
 
 TEST(gradients_have_the_same_bits_for_every_number_of_workers)
@@ -2143,6 +2189,7 @@ int main(int argc, char **argv)
     RUN(gradients_are_added_to_what_is_there);
     RUN(a_gradient_does_not_depend_on_which_others_are_wanted);
     RUN(what_backward_cannot_do_is_refused);
+    RUN(a_refused_render_leaves_its_planes_and_tape_alone);
     RUN(gradients_have_the_same_bits_for_every_number_of_workers);
     RUN(image_gradient_of_bob_spot_0_matches_its_reference);
     RUN(image_gradient_of_bob_spot_1_matches_its_reference);

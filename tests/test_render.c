@@ -819,7 +819,7 @@ TEST(huge_tapes_are_refused_or_had_without_overflow)
     allocator.fail_onwards = 1;
     CHECK(dist_tape_create(ctx, &camera, &how) == NULL);
     CHECK_STATUS(DIST_OUT_OF_MEMORY, dist_context_status(ctx), ctx);
-    CHECK_TEXT("out of memory", dist_context_message(ctx));
+    CHECK_TEXT("dist_tape_create: out of memory", dist_context_message(ctx));
     CHECK_TEXT(sizeof(size_t) > 4 ? "57123" : "out of memory", dist_context_message(ctx));
     dist_context_destroy(ctx);
     CHECK_EQUAL(0, allocator.live_blocks);

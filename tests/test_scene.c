@@ -1079,7 +1079,7 @@ TEST(scenes_refuse_what_cannot_be_placed)
     memset(&good, 0, sizeof good);
     good.field = &field;
     CHECK(dist_scene_create(NULL, 1, &good) == NULL);
-    CHECK(dist_scene_create(ctx, 0, &good) == NULL);
+    CHECK(dist_scene_create(ctx, 0, NULL) == NULL);
     CHECK_TEXT("count is 0, must be 1 to", dist_context_message(ctx));
     dist_context_clear(ctx);
     CHECK(dist_scene_create(ctx, 1, NULL) == NULL);

@@ -170,7 +170,7 @@ static size_t use_check(use *u)
         use_run(u, &arena);
         CHECK(u->made < u->wanted);
         CHECK_EQUAL(DIST_OUT_OF_MEMORY, u->status);
-        CHECK_TEXT(u->made ? "out of memory" : "no context", u->sentence);
+        CHECK_TEXT(u->made ? ": out of memory" : "no context", u->sentence);
     }
     free(memory);
     return bytes;
@@ -316,7 +316,7 @@ TEST(what_cannot_be_made_has_no_bytes_and_a_sentence)
     check_refused(&d, &h, DIST_BAD_ARGUMENT, "context.allocator has one function of two");
     context.allocator = test_allocator_hook(&allocator);
     allocator.fail_at = allocator.requests + 1;
-    check_refused(&d, &h, DIST_OUT_OF_MEMORY, "out of memory");
+    check_refused(&d, &h, DIST_OUT_OF_MEMORY, "dist_workspace_bytes: out of memory");
     CHECK_EQUAL(0, allocator.live_blocks);
     CHECK(dist_workspace_bytes(NULL) > 0); /* a context by itself */
     free(file);

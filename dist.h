@@ -1897,15 +1897,15 @@ typedef struct disti_gemm_weights {
 } disti_gemm_weights;
 
 /* Few points: y[c][o] = bias[o] + sum_k weights(o, k) x[c][k], gemm's bits, over the rows listed in ascending order,
-   with relu no less than 0; then sum[o] = that of y[.][o], 0 only where all are. bias, y and sum are written or read up
-   to out rounded up to 8. */
+   with relu no less than 0; then sum[o] = that of y[.][o], 0 only where all are. Without bias from c = biased on, which
+   is DISTI_FEW_LANES or, of tangents, less. bias, y and sum are written or read up to out rounded up to 8. */
 enum { DISTI_FEW_POINTS = 12, DISTI_FEW_LANES = 16 };
 typedef struct disti_few {
     const float *weights, *bias, *x; /* x (points, stride) */
     const int *list;
     float *y, *sum; /* y (points, stride) */
     size_t stride;
-    int rows, count, out, points, relu;
+    int rows, count, out, points, relu, biased;
 } disti_few;
 
 /* Of least to most points, `points` go first by themselves: gemm takes whole vectors of points. */
@@ -1945,7 +1945,8 @@ typedef struct disti_kernels {
     /* gemm's bits of the `count` outputs listed alone, with ReLU and mask, whose other rows become 0 */
     void (*gemm_some)(const disti_gemm *g, const int *list, int count);
     void (*few)(const disti_few *g);
-    int few_points; /* up to so many points `few` is the faster */
+    int few_points;  /* up to so many points `few` is the faster */
+    int lone_points; /* up to so many `few` with their tangents is faster than a reverse pass: disti_few_gradient */
     const disti_part *parts; /* NULL: none; in ascending order up to one whose least is 0 */
     void (*bound)(const disti_bound *g);
     /* live[o]: 0 where sum[0][o] + sum[4][o] + bias[o] + slack |bias[o]| + the largest of sum[1..3][o] . c
@@ -2507,11 +2508,12 @@ static void disti_relu_scalar(size_t rows, float *y, uint64_t *mask)
 static void disti_few_scalar(const disti_few *g)
 {
     const int relu = g->relu;
+    const float none[8] = {0.0f};
     for (int o = 0; o < (g->out + 7) / 8 * 8; o += 8) {
-        const float *weights = g->weights + (size_t)o * (size_t)g->rows, *bias = g->bias + o;
+        const float *weights = g->weights + (size_t)o * (size_t)g->rows;
         for (int i = 0; i < 8; i++) g->sum[o + i] = 0.0f;
         for (size_t c = 0; c < (size_t)g->points; c++) {
-            const float *x = g->x + c * g->stride;
+            const float *x = g->x + c * g->stride, *bias = c < (size_t)g->biased ? g->bias + o : none;
             float *y = g->y + c * g->stride + o;
 #define DISTI_BEGIN(j) float a##j = bias[j], b##j = bias[4 + j];
 #define DISTI_TERM(j) a##j += w[j] * x[k]; b##j += w[4 + j] * x[k];
@@ -3116,7 +3118,7 @@ DISTI_PLAIN(scalar, static)
 #define DISTI_FEW_MAC(i, j) DISTI_FMA(a##i##j, b, v##j);
 #define DISTI_FEW_ROW(i, V) { const DISTI_VEC b = DISTI_SET1(x##i[k]); DISTI_X##V(DISTI_FEW_MAC, i) }
 #define DISTI_FEW_STORE1(i, j)                                                                                         \
-    a##i##j = DISTI_ADD(a##i##j, DISTI_TWO(g->bias + at##j, g->bias + to##j));                                         \
+    a##i##j = DISTI_ADD(a##i##j, i < g->biased ? DISTI_TWO(g->bias + at##j, g->bias + to##j) : DISTI_SET1(0.0f));      \
     if (g->relu) {                                                                                                     \
         a##i##j = DISTI_RELU(a##i##j);                                                                                 \
         m##j = DISTI_ADD(m##j, a##i##j);                                                                               \
@@ -3701,27 +3703,28 @@ static uint32_t disti_f16_bits(float x) /* not called: dist_net_set_half refuses
 #endif
 
 /* In the order of disti_kernels. */
-#define DISTI_TABLE(isa, few, few_points, parts)                                                                       \
-    {disti_gemm_##isa, disti_gemm_some_##isa, few, few_points, parts, disti_bound_##isa, disti_live_##isa,             \
-     disti_fit_##isa, disti_gemm_back_##isa, disti_gemm_weights_##isa, disti_dot_##isa, disti_outer_##isa,             \
-     disti_lanes_##isa, disti_rows_##isa, disti_points_##isa, disti_angles_##isa, disti_axpy_##isa, disti_relu_##isa,  \
-     disti_activate_##isa, disti_activate_back_##isa, disti_norm_##isa, disti_norm_few_##isa, disti_norm_back_##isa,   \
-     disti_norm_tangents_##isa, disti_activate_tangents_##isa, disti_huge_##isa, disti_transpose_##isa}
+#define DISTI_TABLE(isa, few, few_points, lone_points, parts)                                                          \
+    {disti_gemm_##isa, disti_gemm_some_##isa, few, few_points, lone_points, parts, disti_bound_##isa,                  \
+     disti_live_##isa, disti_fit_##isa, disti_gemm_back_##isa, disti_gemm_weights_##isa, disti_dot_##isa,              \
+     disti_outer_##isa, disti_lanes_##isa, disti_rows_##isa, disti_points_##isa, disti_angles_##isa, disti_axpy_##isa, \
+     disti_relu_##isa, disti_activate_##isa, disti_activate_back_##isa, disti_norm_##isa, disti_norm_few_##isa,        \
+     disti_norm_back_##isa, disti_norm_tangents_##isa, disti_activate_tangents_##isa, disti_huge_##isa,                \
+     disti_transpose_##isa}
 
 /* isa: one that disti_cpu_has */
 static disti_kernels disti_kernels_for(int isa)
 {
 #ifdef DISTI_X86
-    const disti_kernels sse2 = DISTI_TABLE(sse2, disti_few_four_sse2, 4, NULL);
-    const disti_kernels avx2 = DISTI_TABLE(avx2, disti_few_avx2, 8, disti_parts_avx2);
-    const disti_kernels avx512 = DISTI_TABLE(avx512, disti_few_avx512, DISTI_FEW_POINTS, disti_parts_avx512);
+    const disti_kernels sse2 = DISTI_TABLE(sse2, disti_few_four_sse2, 4, 1, NULL);
+    const disti_kernels avx2 = DISTI_TABLE(avx2, disti_few_avx2, 8, 1, disti_parts_avx2);
+    const disti_kernels avx512 = DISTI_TABLE(avx512, disti_few_avx512, DISTI_FEW_POINTS, 3, disti_parts_avx512);
     if (isa != DIST_ISA_SCALAR) return isa == DIST_ISA_SSE2 ? sse2 : isa == DIST_ISA_AVX2 ? avx2 : avx512;
 #endif
 #ifdef DISTI_NEON
-    const disti_kernels neon = DISTI_TABLE(neon, disti_few_four_neon, 4, NULL);
+    const disti_kernels neon = DISTI_TABLE(neon, disti_few_four_neon, 4, 1, NULL);
     if (isa != DIST_ISA_SCALAR) return neon;
 #endif
-    const disti_kernels scalar = DISTI_TABLE(scalar, disti_few_scalar, DISTI_FEW_POINTS, NULL);
+    const disti_kernels scalar = DISTI_TABLE(scalar, disti_few_scalar, DISTI_FEW_POINTS, 1, NULL);
     return (void)isa, scalar;
 }
 
@@ -6397,6 +6400,7 @@ typedef struct disti_block {
     int values; /* no reverse pass follows: masks and slopes need not be kept */
     int channel, channels; /* the output's channels that the reverse pass starts from: the distance, or r, g, b */
     int half; /* 0; or B / 2: lane c + half is the tangent of lane c, see disti_second_block */
+    int tangents; /* 0; or n: lanes n + 3 c to n + 3 c + 2 are those of lane c < n, see disti_few_gradient */
 } disti_block;
 
 /* Returns the bytes needed; base NULL: only that. Sizes are bounded by 32 layers of 8192 + 99 rows. */
@@ -6479,6 +6483,22 @@ static void disti_encode(const dist_net *net, const disti_kernels *kernels, size
         kernels->angles(net->base, net->levels, x + axis * DISTI_BLOCK, stride,
                         rows + (size_t)disti_encoding_row(net, 0, axis, 0) * DISTI_BLOCK,
                         rows + (size_t)disti_encoding_row(net, 0, axis, 1) * DISTI_BLOCK);
+}
+
+/* The tangent along u of the point encoded in rows (., B), `to` lanes on. */
+static void disti_encode_tangent(const dist_net *net, const float *u, float *rows, size_t to)
+{
+    for (int axis = 0; axis < 3; axis++) {
+        float factor = (float)net->base * u[axis];
+        if (net->raw) rows[(size_t)axis * DISTI_BLOCK + to] = u[axis];
+        for (int k = 0; k < net->levels; k++) {
+            size_t s = (size_t)disti_encoding_row(net, k, axis, 0) * DISTI_BLOCK;
+            size_t co = (size_t)disti_encoding_row(net, k, axis, 1) * DISTI_BLOCK;
+            rows[s + to] = factor * rows[co];
+            rows[co + to] = -factor * rows[s];
+            factor *= 2.0f;
+        }
+    }
 }
 
 /* backward  d_p = d_raw + sum_k b 2^k (cos(b 2^k p) d_sin_k - sin(b 2^k p) d_cos_k)
@@ -6975,6 +6995,12 @@ static int disti_net_few(const dist_shape *shape, const disti_block *b, size_t n
            !shape->ctx->blas.sgemm_fn;
 }
 
+/* Whether n points with their gradients do, where they are all that is asked for. */
+static int disti_net_lone(const dist_shape *shape, size_t n)
+{
+    return n > 0 && n <= (size_t)shape->kernels.lone_points && shape->net->layers > 1 && !shape->ctx->blas.sgemm_fn;
+}
+
 /* How many of the n points that are left are evaluated next, at most a block: some counts go faster as parts, one of
    them of few points, where a layer is long enough to pay for a second pass over it. */
 static size_t disti_net_part(const dist_shape *shape, const disti_block *b, size_t n)
@@ -7027,6 +7053,65 @@ static void disti_few_hidden(const dist_shape *shape, const disti_block *b, int 
                        b->slope + (size_t)l * (size_t)net->max_rows * DISTI_BLOCK);
 }
 
+/* The three tangents (3, stride) of a point's sums a to those of gamma h. */
+static void disti_few_norm_tangents(size_t n, float epsilon, const float *gamma, const float *a, size_t stride,
+                                    float *tangent)
+{
+    float *x = tangent, *y = x + stride, *z = y + stride;
+    double mean = 0.0, square = 0.0, middle[3] = {0.0, 0.0, 0.0}, along[3] = {0.0, 0.0, 0.0}, share = 1.0 / (double)n;
+    for (size_t u = 0; u < n; u++) {
+        mean += (double)a[u];
+        middle[0] += (double)x[u];
+        middle[1] += (double)y[u];
+        middle[2] += (double)z[u];
+    }
+    mean *= share;
+    for (size_t u = 0; u < n; u++) {
+        double d = (double)a[u] - mean;
+        square += d * d;
+        along[0] += d * (double)x[u];
+        along[1] += d * (double)y[u];
+        along[2] += d * (double)z[u];
+    }
+    double inverse = 1.0 / sqrt(square * share + (double)epsilon);
+    for (int axis = 0; axis < 3; axis++, tangent += stride)
+        for (size_t u = 0; u < n; u++)
+            tangent[u] = gamma[u] * (float)(inverse * ((double)tangent[u] - share * middle[axis] -
+                                            ((double)a[u] - mean) * inverse * inverse * share * along[axis]));
+}
+
+DISTI_LOOPS static void disti_few_slopes(size_t n, const float *DISTI_RESTRICT slope, float *DISTI_RESTRICT tangent)
+{
+    for (size_t u = 0; u < n; u++) tangent[u] = slope[u] == 0.0f ? 0.0f : slope[u] * tangent[u];
+}
+
+/* What follows the sums y of hidden layer l of few points with tangents, which have no bias: x' = phi'(a) a'; with
+   LayerNorm  h = (a - mean a) / sigma,  x = phi(gamma h + beta),
+              h' = (a' - mean a' - h mean(h a')) / sigma,  x' = phi'(gamma h + beta) gamma h' */
+DISTI_LOOPS static void disti_few_tangents(const dist_shape *shape, const disti_block *b, int l, size_t stride,
+                                           float *y, float *sum, float *slope)
+{
+    const dist_net *net = shape->net;
+    const disti_linear *layer = &net->layer[l];
+    const float *gamma = net->params + layer->norm_weight;
+    size_t out = (size_t)layer->out, whole = disti_round_up(out, 16), n = (size_t)b->tangents;
+    int relu = net->activation == DIST_ACTIVATION_RELU;
+    for (size_t c = 0; c < n && net->normed; c++)
+        disti_few_norm_tangents(out, net->norm_epsilon, gamma, y + c * stride, stride, y + (n + 3 * c) * stride);
+    if (net->normed) {
+        disti_few_turn(shape, b, out, stride, y, DISTI_FEW_LANES, b->delta[1]);
+        shape->kernels.norm_few((int)out, (int)n, stride, net->norm_epsilon, gamma, net->params + layer->norm_bias,
+                                b->delta[1], b->hat, y);
+    }
+    for (size_t c = 0; c < n; c++) {
+        float *x = y + c * stride;
+        for (size_t u = out; u < whole; u++) x[u] = 0.0f;
+        shape->kernels.activate(net->activation, l == 0 ? net->first_scale : net->scale, whole, x, slope);
+        for (size_t axis = 0; axis < 3; axis++) disti_few_slopes(out, slope, y + (n + 3 * c + axis) * stride);
+        for (size_t u = 0; u < out; u++) sum[u] = relu ? (c > 0 ? sum[u] : 0.0f) + x[u] : 1.0f;
+    }
+}
+
 /* disti_net_forward of a few points: activations stand (points, stride), so that weights fill the vectors. The last
    layer's input is put into rows, of which alive ones are written. With masks where a gradient is wanted. */
 static const float *disti_few_forward(const dist_shape *shape, disti_block *b, disti_counter *counter)
@@ -7034,7 +7119,7 @@ static const float *disti_few_forward(const dist_shape *shape, disti_block *b, d
     const dist_net *net = shape->net;
     size_t width = (size_t)net->max_rows, stride = disti_round_up(width, 16), points = (size_t)b->columns;
     int last = net->layers - 1, plain = disti_net_plain(net);
-    float *sum = b->delta[0];
+    float *sum = b->delta[0], *slope = sum + stride;
     double done = 0.0;
     for (int l = 0; l <= last; l++) {
         const disti_linear *layer = &net->layer[l];
@@ -7045,7 +7130,7 @@ static const float *disti_few_forward(const dist_shape *shape, disti_block *b, d
             count += !(sum[u] <= 0.0f);
         }
         b->alive_units[l] = count;
-        for (int i = 0; i < count && plain && !b->values; i++) { /* for the way back */
+        for (int i = 0; i < count && plain && !b->values && !b->tangents; i++) { /* for the way back */
             uint64_t *mask = b->mask + (size_t)l * width + list[i];
             *mask = 0;
             for (size_t c = 0; c < points; c++) *mask |= (uint64_t) !(x[c * stride + (size_t)list[i]] <= 0.0f) << c;
@@ -7060,11 +7145,13 @@ static const float *disti_few_forward(const dist_shape *shape, disti_block *b, d
         done += (double)count * layer->out;
         if (l == last) break;
         disti_few few = {net->panels + layer->panel, shape->bias + (size_t)l * width, x, list, y, sum, stride,
-                         layer->prev + layer->point, count, layer->out, b->columns, plain};
+                         layer->prev + layer->point, count, layer->out, b->columns, plain && !b->tangents,
+                         b->tangents ? b->tangents : DISTI_FEW_LANES};
         shape->kernels.few(&few);
-        if (!plain) disti_few_hidden(shape, b, l, stride, y, sum);
+        if (b->tangents) disti_few_tangents(shape, b, l, stride, y, sum, slope);
+        else if (!plain) disti_few_hidden(shape, b, l, stride, y, sum);
     }
-    counter->done += done * b->columns;
+    counter->done += done * (b->tangents ? b->tangents : b->columns);
     const float *x = b->act[last & 1];
     const int *list = b->alive + (size_t)last * width;
     float *rows = b->act[(last & 1) ^ 1];
@@ -7074,6 +7161,30 @@ static const float *disti_few_forward(const dist_shape *shape, disti_block *b, d
         for (size_t c = points; c < DISTI_BLOCK; c++) row[c] = 0.0f;
     }
     return rows;
+}
+
+/* Value and gradient of so few points that three tangents of each go with them: then they cost the same as four times
+   as many, and no reverse pass as of a block of sixteen follows. To b->value and b->pull. */
+static void disti_few_gradient(const dist_shape *shape, disti_block *b, size_t n, const float *points,
+                               disti_counter *counter)
+{
+    const dist_net *net = shape->net;
+    const disti_linear *layer = &net->layer[net->layers - 1];
+    int last = net->layers - 1, rows = layer->prev + layer->point;
+    const float *w = net->panels + layer->panel + (size_t)b->channel * (size_t)rows;
+    disti_block_load(shape, b, n, points);
+    for (size_t i = 0; i < 3 * n; i++) {
+        const float u[3] = {i % 3 == 0 ? 1.0f : 0.0f, i % 3 == 1 ? 1.0f : 0.0f, i % 3 == 2 ? 1.0f : 0.0f};
+        disti_encode_tangent(net, u, b->point + i / 3, n + i - i / 3);
+    }
+    b->tangents = (int)n;
+    b->columns = 4 * b->tangents;
+    const float *x = disti_few_forward(shape, b, counter);
+    disti_net_output(shape, b, x, b->channel);
+    shape->kernels.dot(w, 0.0f, x, b->alive + (size_t)last * (size_t)net->max_rows, b->alive_count[last], rows,
+                       b->columns, b->seed);
+    for (size_t i = 0; i < 3 * n; i++) b->pull[i] = b->value_slope[i / 3] * b->seed[n + i];
+    b->tangents = 0;
 }
 
 /* Rows left out, too. A unit's pre-activation a(p) = b + sum_k w_k x_k(p) over a block of neighboring points is bounded
@@ -7280,6 +7391,12 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
     int blocks = 0, j = 0;
     disti_blocks_begin(shape, worker, &own, n);
     own.values = !gradient && !seed_fn;
+    if (gradient && !seed_fn && disti_net_lone(shape, n)) {
+        disti_few_gradient(shape, &own, n, points, counter);
+        if (sdf) memcpy(sdf, own.value, n * sizeof(float));
+        memcpy(gradient, own.pull, 3 * n * sizeof(float));
+        return;
+    }
     if (shape->groups) {
         size_t bytes = disti_block_layout(net, NULL, &b);
         disti_group_layout(net, disti_lane(shape->ctx, worker) + bytes, &own, &g);
@@ -7342,18 +7459,8 @@ static void disti_second_block(const dist_shape *shape, int worker, disti_block 
     b->half = DISTI_BLOCK / 2;
     b->columns = DISTI_BLOCK; /* idle lanes repeat the last point with u = 0 and the seeds 0 */
     for (size_t c = 0; c < DISTI_BLOCK / 2; c++) {
-        for (int axis = 0; axis < 3; axis++) {
-            float u = c < n ? directions[3 * c + (size_t)axis] : 0.0f, factor = (float)net->base * u;
-            float *row = b->point + c;
-            if (net->raw) row[(size_t)axis * DISTI_BLOCK + DISTI_BLOCK / 2] = u;
-            for (int k = 0; k < net->levels; k++) {
-                size_t s = (size_t)disti_encoding_row(net, k, axis, 0) * DISTI_BLOCK;
-                size_t co = (size_t)disti_encoding_row(net, k, axis, 1) * DISTI_BLOCK;
-                row[s + DISTI_BLOCK / 2] = factor * row[co];
-                row[co + DISTI_BLOCK / 2] = -factor * row[s];
-                factor *= 2.0f;
-            }
-        }
+        const float none[3] = {0.0f, 0.0f, 0.0f};
+        disti_encode_tangent(net, c < n ? directions + 3 * c : none, b->point + c, DISTI_BLOCK / 2);
     }
     const float *x = disti_net_forward(shape, b, store, disti_counter_of(shape->ctx, worker));
     disti_net_output(shape, b, x, net->sdf_channel);

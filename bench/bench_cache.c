@@ -20,7 +20,8 @@ static const char usage[] =
     "  --size N           pixels along a side of the camera (default 256)\n"
     "  --quick            128 pixels, two resolutions\n";
 
-enum { RAYS, CERTIFIED, SHADOW, OCCLUSION, SPHERES, NEAREST, LONE, CASES, OVER = 8, NEAREST_POINTS = 4096, LONE_POINTS = 256 };
+enum { RAYS, CERTIFIED, SHADOW, OCCLUSION, SPHERES, NEAREST, LONE, CASES };
+enum { OVER = 8, NEAREST_POINTS = 4096, LONE_POINTS = 256 };
 static const char *const names[CASES] = {"rays", "certified", "shadow", "occlusion", "spheres", "nearest", "lone"};
 
 /* A field that counts what it is asked. */

@@ -298,7 +298,8 @@ static int same_values(size_t n, const float *a, const float *b, int normed)
     return same;
 }
 
-/* Gradients of n points. Those of up to three by themselves come with tangents, not by a reverse pass: to rounding. */
+/* Gradients of n points, few enough to be one piece: those of up to three come with tangents, not by a reverse pass,
+   and are the same to rounding. */
 static int same_slopes(size_t n, const float *a, const float *b)
 {
     int same = 1;
@@ -332,6 +333,43 @@ TEST(a_point_has_the_same_bits_in_every_batch)
         }
         case_close(&c);
     }
+}
+
+/* Where tangents overflow before the output's slope, which is 0 or next to it, brings them back: as of more points. */
+TEST(gradients_of_lone_points_are_finite_where_those_of_others_are)
+{
+    enum { N = 40 };
+    const model_desc descs[] = {{.name = "sine", .activation = DIST_ACTIVATION_SINE, .scale = 30, .first_scale = 30},
+                                {.name = "relu"}};
+    int tiny = 0;
+    for (int k = 0; k < 2; k++) {
+        dist_context *ctx = test_context();
+        model m = model_make(&descs[k], 3);
+        for (size_t i = 0; i < m.count; i++) m.params[i] *= 1e12;
+        dist_net *net = model_load(ctx, &m);
+        dist_shape *shape = dist_shape_create(ctx, net, NULL);
+        REQUIRE(shape != NULL);
+        dist_field field = dist_shape_field(shape);
+        float points[3 * N], sdf[N], f, slopes[3 * N], slope[3];
+        test_random random = test_random_seed(5);
+        test_random_fill(&random, 3 * N, points, -0.9f, 0.9f);
+        field.eval_fn(field.user, 0, N, points, sdf, slopes);
+        for (int i = 0; i < N; i++) {
+            field.eval_fn(field.user, 0, 1, points + 3 * i, &f, slope);
+            int block = 1, lone = 1;
+            for (int a = 0; a < 3; a++) {
+                block &= test_finite((double)slopes[3 * i + a]);
+                lone &= test_finite((double)slope[a]);
+            }
+            tiny += block;
+            CHECK(lone >= block);
+        }
+        dist_shape_destroy(shape);
+        dist_net_destroy(net);
+        model_free(&m);
+        dist_context_destroy(ctx);
+    }
+    CHECK(tiny > 0);
 }
 
 /* Every point once, whatever they are: in a box, on a line, at a few places only, all alike, not finite. Each cell is
@@ -1621,6 +1659,7 @@ int main(int argc, char **argv)
     RUN(setting_a_code_equals_making_the_shape_with_it);
     RUN(operations_of_a_net_are_its_multiply_adds);
     RUN(a_point_has_the_same_bits_in_every_batch);
+    RUN(gradients_of_lone_points_are_finite_where_those_of_others_are);
     RUN(points_put_in_order_are_all_there_and_neighbors_stand_together);
     RUN(a_dead_unit_that_is_left_out_changes_no_bit);
     RUN(the_order_of_units_in_memory_does_not_show);

@@ -654,6 +654,30 @@ TEST(real_meshes_load_with_the_counts_of_their_files)
     dist_context_destroy(ctx);
 }
 
+TEST(out_of_memory_names_the_function_that_saves)
+{
+    test_allocator a;
+    dist_context *ctx = files_context(&a);
+    dist_mesh *mesh = files_mesh(ctx);
+    dist_net *net = dist_net_load_file(ctx, "examples/model.safetensors");
+    const float pixels[4] = {1, 2, 3, 4};
+    REQUIRE(mesh && net);
+    a.fail_at = a.requests + 1;
+    a.fail_onwards = 1;
+    CHECK_EQUAL(DIST_OUT_OF_MEMORY, dist_mesh_save(ctx, mesh, test_temp_path("test_files_none.ply")));
+    CHECK_TEXT("dist_mesh_save: out of memory", dist_context_message(ctx));
+    dist_context_clear(ctx);
+    CHECK_EQUAL(DIST_OUT_OF_MEMORY, dist_pfm_save(ctx, test_temp_path("test_files_none.pfm"), 2, 2, 1, pixels));
+    CHECK_TEXT("dist_pfm_save: out of memory", dist_context_message(ctx));
+    dist_context_clear(ctx);
+    CHECK_EQUAL(DIST_OUT_OF_MEMORY, dist_net_save_file(ctx, net, test_temp_path("test_files_none.safetensors")));
+    CHECK_TEXT("dist_net_save_file: out of memory", dist_context_message(ctx));
+    dist_net_destroy(net);
+    dist_mesh_destroy(mesh);
+    dist_context_destroy(ctx);
+    CHECK_EQUAL(0, a.live_blocks);
+}
+
 TEST(every_allocation_of_reading_and_saving_may_fail)
 {
     const char *path = test_temp_path("test_files_failing.obj");
@@ -704,6 +728,7 @@ int main(int argc, char **argv)
     RUN(meshes_are_saved_by_their_ending_and_loaded);
     RUN(folders_empty_and_missing_files_are_sentences_with_the_path);
     RUN(real_meshes_load_with_the_counts_of_their_files);
+    RUN(out_of_memory_names_the_function_that_saves);
     RUN(every_allocation_of_reading_and_saving_may_fail);
     return test_report();
 }

@@ -91,12 +91,13 @@ TEST(every_form_of_file_gives_the_values_that_the_format_says)
     }
 }
 
+/* By the reverse pass, and of one to three points by themselves, with tangents. */
 TEST(every_form_of_file_gives_point_gradients_that_match_differences)
 {
     for (int k = 0; k < MODEL_CASES; k++) {
         net_case c;
-        float sdf[POINTS], gradient[3 * POINTS];
-        double expected[3 * POINTS], closest, p[3], largest = 0.0, worst = 0.0;
+        float sdf[POINTS], gradient[3 * POINTS], lone[3 * POINTS];
+        double expected[3 * POINTS], closest, p[3], largest = 0.0, worst = 0.0, worst_lone = 0.0;
         int excluded = 0, use[POINTS];
         if (!case_open(&c, k)) continue;
         if (c.m.sdf_channel < 0) {
@@ -104,6 +105,10 @@ TEST(every_form_of_file_gives_point_gradients_that_match_differences)
             continue;
         }
         CHECK_STATUS(DIST_OK, dist_field_eval(c.ctx, &c.field, POINTS, c.points, sdf, gradient), c.ctx);
+        for (int i = 0, n = 1; i < POINTS; i += n, n = n % 3 + 1) {
+            n = i + n > POINTS ? POINTS - i : n;
+            dist_field_eval(c.ctx, &c.field, (size_t)n, c.points + 3 * i, sdf, lone + 3 * i);
+        }
         for (int i = 0; i < POINTS; i++) {
             point_of(&c, i, p);
             model_channels(&c.m, c.m.params, c.code, p, NULL, NULL, &closest);
@@ -112,9 +117,13 @@ TEST(every_form_of_file_gives_point_gradients_that_match_differences)
             model_gradient(&c.m, c.m.params, c.code, p, expected + 3 * i);
             for (int j = 0; j < 3; j++) largest = fmax(largest, fabs(expected[3 * i + j]));
         }
-        for (int i = 0; i < 3 * POINTS; i++)
-            if (use[i / 3]) worst = fmax(worst, fabs((double)gradient[i] - expected[i]) / largest);
+        for (int i = 0; i < 3 * POINTS; i++) {
+            if (!use[i / 3]) continue;
+            worst = fmax(worst, fabs((double)gradient[i] - expected[i]) / largest);
+            worst_lone = fmax(worst_lone, fabs((double)lone[i] - expected[i]) / largest);
+        }
         MODEL_CHECK(worst <= 1e-4, c.name, "largest relative error of a gradient", 1e-4, worst);
+        MODEL_CHECK(worst_lone <= 1e-4, c.name, "largest relative error of a lone gradient", 1e-4, worst_lone);
         MODEL_CHECK(10 * excluded <= POINTS, c.name, "points near kinks", POINTS / 10.0, excluded);
         case_close(&c);
     }

@@ -95,9 +95,9 @@ DIST_API const char *dist_version(void);
 
 /* Memory. alloc_fn returns `bytes` bytes aligned to `alignment` (a power of two, at most 64) or NULL; free_fn gets the
    same pointer and size back, never NULL. Called by create, load, save and destroy functions, those that make meshes
-   or measure them, dist_shape_set_texture, dist_net_set_half and, for a field of your own with a code of more than 992
-   numbers, by the first call that wants its gradient; by no other. Like every hook, it may use this library with other
-   contexts than the one that calls it.
+   or measure them, dist_shape_set_texture, dist_net_set_half and, for a field of your own or an analytic one, by the
+   first call that wants the gradient of its code or color (dist_render_backward: of more than 992 numbers); by no
+   other. Like every hook, it may use this library with other contexts than the one that calls it.
    Either both functions or none; none: malloc and free. */
 typedef struct dist_allocator {
     void *user;
@@ -440,7 +440,7 @@ typedef struct dist_net_desc {
                          softplus only, of that best where scale * bound is some 30 or more (f grows slower than the
                          distance then: by half of it at 100). Fourier levels have no share in it. 0: PyTorch's start */
     float bound;      /* radius of the sphere that holds the shape, 1e-6 to 1e6; 0: 1 */
-    float clamp;      /* 0: 0.1 with a code, none without */
+    float clamp;      /* 0: 0.1 with a code, none without one or of a texture */
     unsigned seed;
 } dist_net_desc;
 DIST_API dist_net *dist_net_create(dist_context *ctx, const dist_net_desc *desc);
@@ -605,7 +605,7 @@ typedef struct dist_stats {
 typedef struct dist_hit {
     float distance; /* of the hit, or of the sample of smallest |f|; a ray without one: nearest to the center */
     float error;    /* bound on the distance's error, as good as f's slopes are sampled; no neighbors are asked */
-    float sdf;      /* f there, 0 at a hit; 3e38: no sample */
+    float sdf;      /* f there, within epsilon of 0 at a hit (any_hit: or inside); 3e38: no sample */
     int status;     /* DIST_RAY_* */
 } dist_hit; /* DIST_RAY_NOT_FINITE: distance, error and sdf say nothing */
 
@@ -1356,18 +1356,20 @@ static int disti_is_aligned(const void *p) { return (uintptr_t)p % DISTI_ALIGNME
 
 /* NULL, after disti_fail, where the allocator refuses, ignores the alignment, or bytes is SIZE_MAX (the mark of an
    overflow). */
-static void *disti_alloc(dist_context *ctx, size_t bytes)
+static void *disti_alloc_from(dist_context *ctx, const dist_allocator *from, size_t bytes)
 {
     if (bytes == 0) bytes = DISTI_ALIGNMENT;
-    void *p = bytes == (size_t)-1 ? NULL : ctx->allocator.alloc_fn(ctx->allocator.user, bytes, DISTI_ALIGNMENT);
+    void *p = bytes == (size_t)-1 ? NULL : from->alloc_fn(from->user, bytes, DISTI_ALIGNMENT);
     if (!p) disti_fail(ctx, DIST_OUT_OF_MEMORY, "%s: out of memory: %d bytes were asked for", ctx->function,
                        (double)bytes, 0);
     if (disti_is_aligned(p)) return p;
-    ctx->allocator.free_fn(ctx->allocator.user, p, bytes);
+    from->free_fn(from->user, p, bytes);
     disti_fail(ctx, DIST_OUT_OF_MEMORY, "%s: allocator.alloc_fn gave %d bytes that are not aligned to %d",
                ctx->function, (double)bytes, DISTI_ALIGNMENT);
     return NULL;
 }
+
+static void *disti_alloc(dist_context *ctx, size_t bytes) { return disti_alloc_from(ctx, &ctx->allocator, bytes); }
 
 /* Room for count things of `each` bytes. */
 static void *disti_alloc_array(dist_context *ctx, size_t count, size_t each)
@@ -1860,7 +1862,7 @@ DIST_API int dist_context_workers(const dist_context *ctx)
 /* Points stand in the lanes: activations of a block of DISTI_BLOCK points are rows [unit][DISTI_BLOCK], and a layer's
    weights are packed in panels of eight outputs, element (o, k) at ((o / 8) * rows + k) * 8 + o % 8, so that one
    broadcast serves a whole row. Nothing is ever transposed on the way forward; the reverse pass reads the same
-      packing. */
+   packing. */
 enum { DISTI_BLOCK = 48 };
 
 /* forward   y[o][c] = bias[o] + sum_k weights(o, k) x[k][c]     k ascending over alive[0..alive_count-1], or all rows
@@ -3271,6 +3273,8 @@ static const int *disti_back_rows(const disti_gemm_back *g, int rows, int n, int
 
 #ifdef DISTI_X86
 #define DISTI_PREFETCH(p) _mm_prefetch(p, _MM_HINT_T0)
+/* An instruction on operands 1 and 2 to 0, as AT&T orders them and, with -masm=intel, as Intel does. */
+#define DISTI_ORDERS(name) "{" name " %1, %2, %0|" name " %0, %2, %1}"
 /* Four vectors of four, scaled: their lanes side by side to four rows. */
 #define DISTI_TURN(p, q, r, t, scale, to, stride)                                                                      \
     {                                                                                                                  \
@@ -3324,7 +3328,7 @@ DISTI_FEW_TILE(four_sse2, 4, 2)
 #ifdef _MSC_VER
 #define DISTI_FMA(c, a, b) c = DISTI_MM(fmadd_ps)(a, b, c)
 #else
-#define DISTI_FMA(c, a, b) __asm__("vfmadd231ps %1, %2, %0" : "+v"(c) : "v"(b), "v"(a))
+#define DISTI_FMA(c, a, b) __asm__(DISTI_ORDERS("vfmadd231ps") : "+v"(c) : "v"(b), "v"(a))
 #endif
 #define DISTI_POSITIVE(v) (unsigned)_mm256_movemask_ps(_mm256_cmp_ps(v, _mm256_setzero_ps(), _CMP_NLE_UQ))
 #define DISTI_KEEP(v, bits) disti_keep_avx2(v, (int)((bits) & 0xff))
@@ -3540,7 +3544,7 @@ typedef struct disti_half {
 #undef DISTI_FMA
 #define DISTI_FUNCTION DISTI_TARGET("avx512f,avx512bw,avx512dq,avx512vl,fma,avx512fp16") DISTI_KERNEL static
 /* By name also because clang 14's intrinsics are there only where the whole program is built for them. */
-#define DISTI_FMA(c, a, b) __asm__("vfmadd231ph %1, %2, %0" : "+v"(c) : "v"(b), "v"(a))
+#define DISTI_FMA(c, a, b) __asm__(DISTI_ORDERS("vfmadd231ph") : "+v"(c) : "v"(b), "v"(a))
 #define DISTI_ROWS 1
 #define DISTI_FLUSH1(i, j) disti_flush_f16(sums + i * DISTI_COLUMNS + j * 32, a##i##j);
 #define DISTI_STEPS_BEGIN(V) DISTI_Y8(DISTI_ZERO, V)
@@ -3568,12 +3572,12 @@ DISTI_HALF_KERNEL(f16)
 #undef DISTI_STEPS_BEGIN
 #undef DISTI_FINISH
 #define DISTI_FUNCTION DISTI_TARGET("avx512f,avx512bw,avx512dq,avx512vl,fma,avx512bf16") DISTI_KERNEL static
-#define DISTI_FMA(c, a, b) __asm__("vdpbf16ps %1, %2, %0" : "+v"(c) : "v"(b), "v"(a))
+#define DISTI_FMA(c, a, b) __asm__(DISTI_ORDERS("vdpbf16ps") : "+v"(c) : "v"(b), "v"(a))
 #define DISTI_ROWS 2
 #define DISTI_FLUSH1(i, j) _mm512_storeu_ps(sums + i * DISTI_COLUMNS + j * 16, a##i##j);
 #define DISTI_BIAS1(i, j) __m512 a##i##j = b##i;
 #define DISTI_BIAS(i, V) const __m512 b##i = _mm512_set1_ps(bias[i]); DISTI_X##V(DISTI_BIAS1, i)
-#define DISTI_MAC32(i, j) __asm__("vfmadd231ps %1, %2, %0" : "+v"(a##i##j) : "v"(x##j), "v"(b));
+#define DISTI_MAC32(i, j) __asm__(DISTI_ORDERS("vfmadd231ps") : "+v"(a##i##j) : "v"(x##j), "v"(b));
 #define DISTI_SIDE32(i, V) { const __m512 b = _mm512_set1_ps(ws[i]); DISTI_X##V(DISTI_MAC32, i) }
 /* All steps are one run, whose sums begin in registers. */
 #define DISTI_STEPS_BEGIN(V)                                                                                           \
@@ -3586,7 +3590,7 @@ DISTI_FUNCTION __m512i disti_narrow_bf16(__m512 low, __m512 high)
                                             0x170007, 0x180008, 0x190009, 0x1a000a, 0x1b000b, 0x1c000c, 0x1d000d,
                                             0x1e000e, 0x1f000f);
     __m512i both;
-    __asm__("vcvtne2ps2bf16 %1, %2, %0" : "=v"(both) : "v"(low), "v"(high));
+    __asm__(DISTI_ORDERS("vcvtne2ps2bf16") : "=v"(both) : "v"(low), "v"(high));
     return _mm512_maskz_permutexvar_epi16(0xffffffffu, pairs, both);
 }
 /* With ReLU the run ends in registers, too. A sum that is not finite shows in that of all; if only the latter is not,
@@ -3812,6 +3816,7 @@ static disti_kernels disti_kernels_for(int isa)
 #undef DISTI_TRANSPOSE
 #undef DISTI_MOST4
 #undef DISTI_PREFETCH
+#undef DISTI_ORDERS
 #undef DISTI_FUNCTION
 #undef DISTI_VEC
 #undef DISTI_LANES
@@ -4303,9 +4308,9 @@ static void disti_color_task(void *arg, int index, int worker)
 static dist_status disti_color_check(dist_context *ctx, const dist_field *field, int adjoint, const char *function)
 {
     if (!field) return disti_refuse(ctx, "%s: field is NULL", function);
-    if (adjoint ? !field->color_adjoint_fn : !field->color_fn)
-        return disti_fail(ctx, DIST_UNSUPPORTED, adjoint ? "%s: the field's color has no adjoint"
-                                                         : "%s: the field has no color", function, 0, 0);
+    if (!field->color_fn || (adjoint && !field->color_adjoint_fn))
+        return disti_fail(ctx, DIST_UNSUPPORTED, field->color_fn ? "%s: the field's color has no adjoint"
+                                                                 : "%s: the field has no color", function, 0, 0);
     if (field->code_size < 0 || field->color_code_size < 0)
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.code_size is %d, color_code_size %d, must not be negative",
                           function, field->code_size, field->color_code_size);
@@ -4602,10 +4607,13 @@ static dist_status disti_code_begin(dist_context *ctx, const dist_field *field, 
                                     double **d_code)
 {
     size_t size = (size_t)field->code_size;
+    *d_code = NULL;
+    if (!grads->code) return DIST_OK;
     dist_status status = disti_partial_for(ctx, size);
-    *d_code = status == DIST_OK && grads->code ? ctx->partial + (size_t)DISTI_SLOTS * size : NULL;
-    if (*d_code) memset(*d_code, 0, size * sizeof(double));
-    return status;
+    if (status != DIST_OK) return status;
+    *d_code = ctx->partial + (size_t)DISTI_SLOTS * size;
+    memset(*d_code, 0, size * sizeof(double));
+    return DIST_OK;
 }
 
 /* name: of the function that failures are told of. */
@@ -7388,7 +7396,7 @@ static void disti_shape_fused(void *user, int worker, size_t n, const float *poi
     for (size_t at = 0, count; at < n; at += count, j++) {
         count = DISTI_MIN(n - at, (size_t)DISTI_BLOCK);
         int part = (int)DISTI_MIN(n - at, (size_t)DISTI_GROUP_POINTS);
-        if (j == blocks && shape->groups > own.values && n - at >= DISTI_GROUP_LEAST &&
+        if (j >= blocks && shape->groups > own.values && n - at >= DISTI_GROUP_LEAST &&
             disti_finite_all(3 * (size_t)part, points + 3 * at)) { /* no bound around a point that is not */
             counter->done += disti_group_forward(shape, &g, part, points + 3 * at);
             blocks = g.blocks;
@@ -8115,7 +8123,7 @@ static void disti_shape_slope(dist_shape *shape, const dist_field *field)
         }
         field->eval_fn(shape, 0, DISTI_BLOCK, points, sdf, gradient);
         disti_block_layout(net, disti_lane(shape->ctx, 0), &b);
-        for (int l = 1; l < net->layers; l++)
+        for (int l = 1; net->activation == DIST_ACTIVATION_RELU && l < net->layers; l++)
             for (int k = 0; k < net->layer[l].prev; k++)
                 if (!b.mask[(size_t)l * (size_t)net->max_rows + (size_t)k]) shape->all_alive &= ~((uint32_t)1 << l);
         for (int j = 0; j < DISTI_BLOCK; j++) {
@@ -8652,10 +8660,8 @@ DIST_API dist_status dist_net_set_half(dist_context *ctx, dist_net *net, int kin
     for (int l = 0; l + 1 < net->layers && kind != DIST_HALF_OFF; l++) /* at most panel_count in all: that exists */
         count += disti_half_steps(&net->layer[l], kind) * disti_round_up((size_t)net->layer[l].out, 8);
     if (count > 0) {
-        panels = (float *)net->allocator.alloc_fn(net->allocator.user, count * sizeof(float), DISTI_ALIGNMENT);
-        if (!panels)
-            return disti_fail(ctx, DIST_OUT_OF_MEMORY, "%s: out of memory: %d bytes were asked for", name,
-                              (double)count * sizeof(float), 0);
+        panels = (float *)disti_alloc_from(ctx, &net->allocator, count * sizeof(float)); /* the net's, not ctx's */
+        if (!panels) return DIST_OUT_OF_MEMORY;
     }
     dist_allocator *own = &net->allocator;
     if (net->half_panels) own->free_fn(own->user, net->half_panels, net->half_count * sizeof(float));
@@ -9848,7 +9854,7 @@ DISTI_INLINE void disti_ray_place(const dist_field *field, double cx, double cy,
     ray->footprint = (float)footprint;
     ray->sign = 1.0f;
     ray->fbest = 3e38f;
-    half = half > 0.0 ? sqrt(half) : -1.0;
+    half = half > 0.0 ? sqrt(half) : 0.0;
     float enter = (float)(-half > -along ? -half : -along), leave = (float)half; /* nothing behind the camera */
     int meets = half > 0.0 && enter < leave;
     ray->leave = meets ? leave : enter;
@@ -14014,7 +14020,7 @@ typedef struct disti_warm {
     unsigned char *open;  /* 1: not decided by the cones; 2: and its hit was not where it was looked for */
     unsigned char *ask;   /* DISTI_ASK_* */
     unsigned char *row;   /* of the tile: i / width */
-    float change, mean;   /* largest change of f in the tile, no less than its mean over the picture */
+    float change;         /* largest change of f in the tile, no less than its mean over the picture */
     float typical;        /* mean change of f at every 8th hit */
     unsigned calm;        /* disti_warm_calm */
     int due, late;        /* all least |f| are looked for anew; neighbors are known as far as they will be */
@@ -14322,11 +14328,11 @@ static int disti_warm_good(disti_warm *warm, size_t tried)
 
 /* Whether it is the tile's turn to have all of its least |f| looked for anew, in 2 to 8 turns: before the picture has
    moved by about half a hundredth of the radius, so that f where it was least is still the least to second order. */
-static int disti_warm_minima_due(const disti_warm *warm, float change)
+static int disti_warm_minima_due(const disti_warm *warm)
 {
     unsigned period = 2, x = (unsigned)warm->tile->x / DISTI_TILE, y = (unsigned)warm->tile->y / DISTI_TILE;
     float most = 2e-3f * warm->tracer->field->radius;
-    while (period < DISTI_WARM_MINIMA && (float)period * change < most) period *= 2;
+    while (period < DISTI_WARM_MINIMA && (float)period * warm->change < most) period *= 2;
     return !warm->tape->has_silhouette || (x * 5u + y * 3u + warm->tape->turn) % period == 0;
 }
 
@@ -14779,9 +14785,9 @@ static void disti_render_warm(const disti_render_job *job, int worker, const dis
     warm.worker = worker;
     warm.n = tile->width * tile->height;
     warm.silhouette = job->least;
-    warm.change = warm.mean = job->change;
+    warm.change = job->change;
     warm.calm = disti_warm_calm(job->change, job->tracer->field->radius);
-    warm.due = warm.silhouette && disti_warm_minima_due(&warm, warm.mean);
+    warm.due = warm.silhouette && disti_warm_minima_due(&warm);
     warm.moved = (float *)(void *)bench->rest;
     warm.drift = warm.moved + warm.n;
     warm.open = bench->rest + (size_t)warm.n * 2 * sizeof(float);
@@ -15085,7 +15091,7 @@ static int disti_render_list(const disti_tracer *tracer, const disti_view *view,
     if (!pixels || job->least || tracer->how.trace != DIST_TRACE_GUARDED) return 0;
     for (size_t i = 0; i < n; i++) {
         wanted += pixels[i] != 0;
-        pairs += pixels[i] && i + 1 < n && pixels[i + 1];
+        pairs += pixels[i] && (i + 1) % (size_t)view->width != 0 && pixels[i + 1];
     }
     if (8 * pairs > wanted) return 0;
     size_t each = job->each = DISTI_MAX(wanted / DISTI_LIST_TASKS + 1, (size_t)DISTI_LIST_RAYS / 16);
@@ -16998,7 +17004,7 @@ static int disti_text_number(disti_text *t, double *out)
            (*c == '+' || (*c >= '-' && *c <= '9' && *c != '/') || *c == 'e' || *c == 'E');
          c++) {
         if (*c == '.' && (n == 0 || copy[n - 1] < '0')) copy[n++] = '0';
-        if (*c != '.' || (c + 1 < t->end && c[1] >= '0' && c[1] <= '9')) copy[n++] = *c;
+        if (*c != '.' || (c + 1 < t->end && (c[1] == '.' || (c[1] >= '0' && c[1] <= '9')))) copy[n++] = *c;
     }
     if (n + 2 >= sizeof copy) return disti_parse_double(&t->at, t->end, out);
     if (!disti_parse_double(&cursor, copy + n, out) || cursor != copy + n) return 0;
@@ -17755,8 +17761,10 @@ static dist_status disti_measure_shapes(dist_context *ctx, const dist_net *net, 
     status = disti_scene_take(&scene);
     if (status != DIST_OK) return status;
     dist_field field = dist_shape_field(&shape);
-    size_t codes;
-    disti_size_mul((size_t)instances, disti_field_code(&field) + 7 + (size_t)field.color_code_size, &codes);
+    size_t codes, each = disti_field_code(&field) + 7 + (size_t)field.color_code_size;
+    if (!field.eval_fn || !disti_size_mul((size_t)instances, each, &codes) || codes > 0x7fffffffu)
+        return disti_refuse(ctx, "%s: the instances have no distance, or codes of more than 2^31 numbers in all",
+                            "dist_workspace_bytes");
     return disti_partial_for(ctx, codes);
 }
 
@@ -17839,6 +17847,7 @@ DIST_API size_t dist_workspace_bytes(const dist_workspace_desc *desc)
 #ifdef DISTI_WORDS
 #define near
 #define far
+#undef DISTI_WORDS
 #endif
 
 #endif /* DIST_IMPLEMENTED */

@@ -112,6 +112,8 @@ if [ -n "$quick" ]; then
     else
         skip_row avx2 "make test has run with it if this processor has it"
     fi
+    # Inline assembly in the other dialect.
+    isa_row masm build/matrix/masm $cc "-O2 -masm=intel" "" 1 test_kernels test_half
     # As most programs are built, with multiply-adds where the compiler sees them: the same ones for few points and many.
     isa_row native_scalar build/matrix/native $cc "-O3 -march=native -ffp-contract=fast" scalar 1 test_net
 else
@@ -133,6 +135,7 @@ else
         row "${cc}_O3" "build/matrix/${cc}_O3" $cc "-O3" "" "" ""
         row "${cc}_native" "build/matrix/${cc}_native" $cc "-O3 -march=native -ffp-contract=fast" "" "" ""
         isa_row "${cc}_native_scalar" "build/matrix/${cc}_native" $cc "-O3 -march=native -ffp-contract=fast" scalar ""
+        isa_row "${cc}_masm" "build/matrix/${cc}_masm" $cc "-O2 -masm=intel" "" "" test_kernels test_half test_net
         row "${cc}_fast_math" "build/matrix/${cc}_fast_math" $cc "-O2 -ffast-math" "" "" ""
         isa_row "${cc}_fast_math_scalar" "build/matrix/${cc}_fast_math" $cc "-O2 -ffast-math" scalar ""
         if can $cc -fopenmp; then

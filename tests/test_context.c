@@ -430,6 +430,30 @@ TEST(an_allocator_that_ignores_the_alignment_is_refused)
         dist_context_destroy(ctx);
         CHECK_EQUAL(0, a.held);
     }
+    a.good = 1000;
+    a.used = 0;
+    dist_context_desc desc = test_context_desc();
+    dist_net_desc small;
+    memset(&small, 0, sizeof small);
+    small.layers = 3;
+    small.width = 16;
+    desc.allocator.user = &a;
+    desc.allocator.alloc_fn = askew_alloc;
+    desc.allocator.free_fn = askew_free;
+    dist_context *ctx = dist_context_create(&desc);
+    dist_net *net = dist_net_create(ctx, &small);
+    REQUIRE(net != NULL);
+    a.good = 0;
+    if (disti_cpu_half(DIST_HALF_F16) || disti_cpu_half(DIST_HALF_BF16)) { /* of memory that is the net's, not ctx's */
+        dist_context *other = test_context();
+        CHECK_STATUS(DIST_OUT_OF_MEMORY, dist_net_set_half(other, net, DIST_HALF_AUTO), other);
+        CHECK_TEXT("dist_net_set_half: allocator.alloc_fn gave", dist_context_message(other));
+        CHECK_EQUAL(DIST_HALF_OFF, dist_net_half(net));
+        dist_context_destroy(other);
+    }
+    dist_net_destroy(net);
+    dist_context_destroy(ctx);
+    CHECK_EQUAL(0, a.held);
 }
 
 TEST(every_isa_is_in_force_or_refused_by_name)

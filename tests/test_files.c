@@ -407,6 +407,8 @@ TEST(mesh_files_that_mean_harm_are_refused_with_a_sentence)
         "OFF\n3 1 0\n0 0 0\n0 0 0\n0 0 0\n2.5 0 1 2\n",
         "v 0 0\n",
         "v 0 0 x\n",
+        "v 1..2 0 0\n",
+        "v 1.2.3 0 0\n",
         "v inf 0 0\n",
         "v nan 0 0\n",
         "v 0 0 0\nf 1 1 2\n",

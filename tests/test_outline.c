@@ -300,6 +300,32 @@ TEST(outline_gradient_has_the_same_bits_for_every_number_of_workers)
     }
 }
 
+TEST(an_adjoint_of_a_color_that_is_none_is_refused)
+{
+    float code[4] = {0, 0, 0, 0.5f}, depth[16], d_color[48] = {1};
+    dist_context *ctx = test_context();
+    dist_field field = flat_sphere(code);
+    dist_camera camera = camera_at(4, 0.0);
+    dist_render_desc how = outline_how(0.1f);
+    dist_images out, d_out;
+    dist_gradients grads;
+    float d_code[4] = {0, 0, 0, 0};
+    memset(&out, 0, sizeof out);
+    memset(&d_out, 0, sizeof d_out);
+    memset(&grads, 0, sizeof grads);
+    out.depth = depth;
+    d_out.color = d_color;
+    grads.code = d_code;
+    field.color_fn = NULL;
+    CHECK(field.color_adjoint_fn != NULL);
+    dist_tape *tape = dist_tape_create(ctx, &camera, &how);
+    CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, tape), ctx);
+    CHECK_STATUS(DIST_UNSUPPORTED, dist_render_backward(ctx, tape, &d_out, &grads), ctx);
+    CHECK_TEXT("dist_render_backward: the field has no color", dist_context_message(ctx));
+    dist_tape_destroy(tape);
+    dist_context_destroy(ctx);
+}
+
 TEST(a_band_that_is_no_length_is_refused)
 {
     static const uint32_t wrong[3] = {0xbf800000u, 0x7fc00000u, 0x7f800000u}; /* -1, NaN, infinity */
@@ -327,6 +353,7 @@ int main(int argc, char **argv)
     RUN(outline_gradient_is_the_derivative_of_the_area_but_for_the_bands_width);
     RUN(a_sphere_is_found_by_its_color_alone);
     RUN(outline_gradient_has_the_same_bits_for_every_number_of_workers);
+    RUN(an_adjoint_of_a_color_that_is_none_is_refused);
     RUN(a_band_that_is_no_length_is_refused);
     return test_report();
 }

@@ -897,6 +897,22 @@ TEST(small_slopes_finish_or_report_with_an_honest_bound)
 }
 
 /* 4, 20 */
+TEST(rays_beside_the_sphere_tell_where_they_are_nearest_to_its_center)
+{
+    const float rays[3][7] = {{0, 5, -3, 0, 0, 1, 3}, {0, 0.3f, -0.2f, 0, 0, 2, 0.2f}, {0, 5, 3, 0, 0, 1, 0}};
+    dist_context *ctx = shape_context();
+    for (int k = 0; k < 3; k++) { /* the last one has it behind itself */
+        float ball[4] = {0, 0, 0, 0.1f};
+        dist_field field = dist_field_sphere(ball);
+        dist_hit hit;
+        CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, 1, rays[k], rays[k] + 3, NULL, &hit, NULL), ctx);
+        CHECK_EQUAL(DIST_RAY_MISS, hit.status);
+        CHECK_NEAR((double)rays[k][6], hit.distance, 1e-6);
+        CHECK(hit.sdf > 2e38f);
+    }
+    dist_context_destroy(ctx);
+}
+
 TEST(constant_fields_end_within_the_budget_with_the_right_status)
 {
     dist_context *ctx = shape_context();
@@ -2298,6 +2314,7 @@ int main(int argc, char **argv)
     RUN(grazing_rays_hit_within_the_bound_or_say_that_they_are_unresolved);
     RUN(twelve_queries_finish_98_of_100_rays_once_they_have_crossed);
     RUN(small_slopes_finish_or_report_with_an_honest_bound);
+    RUN(rays_beside_the_sphere_tell_where_they_are_nearest_to_its_center);
     RUN(constant_fields_end_within_the_budget_with_the_right_status);
     RUN(a_camera_inside_the_sphere_starts_at_itself_and_ends_at_the_exit);
     RUN(a_camera_inside_the_solid_gets_what_the_desc_says);

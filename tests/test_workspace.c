@@ -323,6 +323,44 @@ TEST(what_cannot_be_made_has_no_bytes_and_a_sentence)
     model_free(&m);
 }
 
+/* As dist_scene_create refuses them. */
+TEST(instances_that_make_no_scene_have_no_bytes)
+{
+    static const model_desc colors = {.channels = "r,g,b", .code_size = 3};
+    dist_context *ctx = test_context();
+    model m = model_make(&colors, 7);
+    size_t size;
+    unsigned char *file = model_file(&m, &size);
+    heard h;
+    dist_context_desc context = test_context_desc();
+    dist_net_desc desc;
+    dist_workspace_desc d;
+    memset(&h, 0, sizeof h);
+    memset(&desc, 0, sizeof desc);
+    memset(&d, 0, sizeof d);
+    context.logger.user = &h;
+    context.logger.log_fn = hear;
+    desc.layers = 2;
+    desc.width = 4;
+    desc.code_size = 2041; /* and seven numbers: 2^11 for each */
+    dist_net *net = dist_net_create(ctx, &desc);
+    d.context = &context;
+    d.net = net;
+    d.shapes = 1;
+    d.instances = (1 << 20) - 1;
+    CHECK(dist_workspace_bytes(&d) > 0);
+    d.instances++;
+    check_refused(&d, &h, DIST_BAD_ARGUMENT, "dist_workspace_bytes: the instances have no distance, or codes of more");
+    d.net = NULL, d.model = file, d.model_size = size, d.instances = 0;
+    CHECK(dist_workspace_bytes(&d) > 0);
+    d.instances = 1;
+    check_refused(&d, &h, DIST_BAD_ARGUMENT, "dist_workspace_bytes: the instances have no distance");
+    dist_net_destroy(net);
+    free(file);
+    model_free(&m);
+    dist_context_destroy(ctx);
+}
+
 /* They share what they keep for it; what one leaves there must not reach another's. */
 TEST(shapes_in_turn_have_the_weight_gradients_that_each_has_alone)
 {
@@ -451,6 +489,7 @@ int main(int argc, char **argv)
     test_begin(argc, argv);
     RUN(an_arena_of_exactly_so_many_bytes_suffices);
     RUN(what_cannot_be_made_has_no_bytes_and_a_sentence);
+    RUN(instances_that_make_no_scene_have_no_bytes);
     RUN(shapes_in_turn_have_the_weight_gradients_that_each_has_alone);
     RUN(memory_is_that_of_tiles_without_a_tape_and_a_few_bytes_a_pixel_with_one);
     RUN(a_large_picture_without_a_tape_takes_no_more_memory_than_a_small_one);

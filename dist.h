@@ -179,7 +179,7 @@ DIST_API int dist_context_workers(const dist_context *ctx);
 /* ---- 04 field ---------------------------------------------------------------------------------------------------- */
 
 /* Tells d_sdf (count) for points first..first+count-1 once their sdf (count) and gradient (count, 3) are known;
-   gradient is NULL where weights' gradients are wanted. Called from several workers at once. */
+   gradient may be NULL where weights' gradients are wanted. Called from several workers at once. */
 typedef void (*dist_seed_fn)(void *seed_user, size_t first, size_t count, const float *sdf, const float *gradient,
                              float *d_sdf);
 
@@ -244,13 +244,17 @@ typedef struct dist_field {
     size_t weight_count;       /* length of d_weights; 0: none */
     int color_code_size;       /* length of d_color_code */
     size_t color_weight_count; /* of a color net of its own; 0: the weights of color, if any, are among weight_count */
+    /* whose weights, and whose a color net's of its own: instances of a scene that have the same share their part of
+       the scene's. Set by dist_shape_field and dist_scene_field; NULL: nobody else's */
+    const void *weights_of, *color_weights_of;
     dist_context *owner; /* the context that made it; NULL: any */
     /* a number that changes with what user points to, so that a cache of what it was is refused. Set by
        dist_shape_field and dist_scene_field, whose functions give 0 where eval_fn is not theirs any more; NULL: that is
        not looked at */
     unsigned (*changes_fn)(const struct dist_field *field);
-    /* 1: since the field was taken the shape, or one of the scene's, has got another texture, so its color is refused.
-       Set likewise, 0 where color_fn is not theirs any more; NULL: that is not looked at */
+    /* since the field was taken, bit 0: the shape, or one of the scene's, has got another texture, so its color is
+       refused (0 where color_fn is not theirs any more); bit 1: the scene's weights have become more or fewer, so their
+       gradient is. Set likewise; NULL: that is not looked at */
     int (*stale_fn)(const struct dist_field *field);
     unsigned textures; /* how often it had got one then */
     const struct dist_cache *cache; /* set by dist_cache_field; NULL: none */
@@ -346,18 +350,23 @@ DIST_API dist_scene *dist_scene_create(dist_context *ctx, int count, const dist_
 DIST_API void dist_scene_destroy(dist_scene *scene);
 /* Moves an instance or replaces its field (NULL: it stays) by one whose code is as long and that has a color if the old
    one had. No allocator call. Take dist_scene_field again afterwards, and set it in a scene that holds this one: the
-   bounding sphere changes. */
+   bounding sphere changes, and where the weights stand. */
 DIST_API dist_status dist_scene_set(dist_scene *scene, int index, const dist_instance *instance);
-/* The scene as a field. Borrows the scene. No gradient for weights. Its code is, for each instance, its field's code
-   (nothing if that has no adjoint), then its placement as dist_similarity_move has it: log-scale, w of
-   R' = exp([w]x) R, translation; dist_gradients.code gets the gradients for all of them, with the bounding spheres of
-   scenes held where they are, which matters outside of those alone. It has a color if every instance has, with an
-   adjoint if each has one; its color code is theirs one after another. The gradient of its normals is that of
-   differences over how.normal_delta, of smooth nets, too. */
+/* The scene as a field. Borrows the scene. Its code is, for each instance, its field's code (nothing if that has no
+   adjoint), then its placement as dist_similarity_move has it: log-scale, w of R' = exp([w]x) R, translation;
+   dist_gradients.code gets the gradients for all of them, with the bounding spheres of scenes held where they are, which
+   matters outside of those alone. Its weights are those of the instances' nets, each net's once, in order of first use
+   (a scene in it: that scene's). It has a color if every instance has, with an adjoint if each has one; its color code
+   is theirs one after another, its color weights those of the textures, each texture's once; where only some instances
+   have a texture the weights of color get no gradient. The gradient of its normals is that of differences over
+   how.normal_delta, of smooth nets, too. */
 DIST_API dist_field dist_scene_field(dist_scene *scene);
 /* Where instance `index` begins in the scene's code; its placement are the seven numbers before instance index + 1.
    index = count: all of them. -1 out of range. */
 DIST_API int dist_scene_offset(const dist_scene *scene, int index);
+/* Where the weights of the net of instance `index` begin in the scene's, color 1: its texture's in the color's; of
+   instances of one net the same. (size_t)-1 out of range. */
+DIST_API size_t dist_scene_weight_offset(const dist_scene *scene, int index, int color);
 /* Which instance f is least of at each of n points, index (n): after dist_trace, what was hit. Away from the surfaces
    that is not always the nearest, as f is a bound there: dist_field_closest_point, and then this. */
 DIST_API dist_status dist_scene_find(dist_scene *scene, size_t n, const float *points, int *index);
@@ -4142,7 +4151,7 @@ static unsigned disti_changes(const dist_field *field)
 
 static int disti_stale(const dist_field *field)
 {
-    return field->stale_fn && field->stale_fn(field);
+    return field->stale_fn ? field->stale_fn(field) : 0;
 }
 
 /* The figure from |f| = disti_far_from on. */
@@ -4315,7 +4324,7 @@ static dist_status disti_color_check(dist_context *ctx, const dist_field *field,
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.code_size is %d, color_code_size %d, must not be negative",
                           function, field->code_size, field->color_code_size);
     if (field->owner && field->owner != ctx) return disti_refuse(ctx, "%s: field belongs to another context", function);
-    if (disti_stale(field))
+    if (disti_stale(field) & 1)
         return disti_refuse(ctx, "%s: the field, or one in its scene, is older than its shape's texture; take it anew",
                             function);
     return DIST_OK;
@@ -4537,6 +4546,9 @@ static dist_status disti_gradients_check(dist_context *ctx, const dist_field *fi
     if (grads->weights && !field->weights_fn)
         return disti_fail(ctx, DIST_UNSUPPORTED, "%s: grads.weights is given, but the field has no weights_fn",
                           function, 0, 0);
+    if ((grads->weights || grads->color_weights) && (disti_stale(field) & 2))
+        return disti_refuse(ctx, "%s: the scene has got a field with more or fewer weights since its field was taken; "
+                                 "take it anew", function);
     if (grads->color_code && (field->color_code_size <= 0 || !field->color_adjoint_fn))
         return disti_refuse(ctx, "%s: grads.color_code is given, but the field has no color code or color_adjoint_fn",
                             function);
@@ -4734,6 +4746,7 @@ typedef struct disti_placed {
     float scale, inverse, rotation[9], translation[3]; /* inverse: 1 / scale */
     size_t code, offset; /* numbers of its field's code that have an adjoint; where they stand in the scene's */
     size_t color_offset; /* where its color code stands in the scene's */
+    size_t weights[2];   /* where its weights and those of its texture stand in the scene's */
 } disti_placed;
 
 typedef struct disti_ball {
@@ -4747,6 +4760,7 @@ struct dist_scene {
     disti_ball *ball;
     unsigned char *scratch; /* ctx->workers times scratch_bytes */
     size_t scratch_bytes, code_size, color_code_size;
+    size_t weight_count[2]; /* of the nets and of the textures; 0 where they are too many */
     unsigned changes; /* of the placements and fields, so far */
 };
 
@@ -4832,14 +4846,24 @@ static float disti_placed_value(const disti_placed *placed, const disti_ball *ba
     return DISTI_MIN(b, m + (d > m ? d - m : m - d));
 }
 
-/* The same with its gradient, from g = grad f, and weight = df_i/df. */
+/* df_i/df there. */
+static float disti_placed_weight(const disti_placed *placed, const disti_ball *ball, float d, float f)
+{
+    float b = placed->scale * f, v = DISTI_MAX(b, 0.0f);
+    if (!disti_finite(b)) return placed->scale;
+    if (d > 0.0f) b = sqrtf(d * d + v * v);
+    if (b > ball->margin + fabsf(d - ball->margin)) return 0.0f;
+    return d > 0.0f ? placed->scale * (v / b) : placed->scale;
+}
+
+/* Value and weight with the gradient, from g = grad f. */
 static float disti_placed_gradient(const disti_placed *placed, const disti_ball *ball, const float *p, float d, float f,
                                    const float *g, float *gradient, float *weight)
 {
     const float *m = placed->rotation;
     float n[3], v = DISTI_MAX(placed->scale * f, 0.0f), value = disti_placed_value(placed, ball, d, f), along = 0.0f;
     float length = DISTI_MAX(d + ball->radius, 1e-30f);
-    *weight = placed->scale;
+    *weight = disti_placed_weight(placed, ball, d, f);
     for (int i = 0; i < 3; i++) {
         n[i] = (p[i] - ball->center[i]) / length;
         gradient[i] = m[3 * i] * g[0] + m[3 * i + 1] * g[1] + m[3 * i + 2] * g[2];
@@ -4848,10 +4872,8 @@ static float disti_placed_gradient(const disti_placed *placed, const disti_ball 
     if (!disti_finite(value)) return value;
     float b = d > 0.0f ? sqrtf(d * d + v * v) : placed->scale * f, beside = d - ball->margin;
     if (b > ball->margin + fabsf(beside)) {
-        *weight = 0.0f;
         for (int i = 0; i < 3; i++) gradient[i] = beside > 0.0f ? n[i] : -n[i];
     } else if (d > 0.0f) {
-        *weight *= v / b;
         for (int i = 0; i < 3; i++)
             gradient[i] = (d * n[i] + v * ball->radius / length * (gradient[i] - n[i] * along)) / b;
     }
@@ -5171,7 +5193,18 @@ static void disti_scene_unpaint(const disti_placed *placed, int worker, const di
     }
 }
 
-/* The color of the instance whose surface is nearest; with `back` its adjoint. */
+/* After they have settled, the points in order of the instance whose surface is nearest, which paints them. */
+static void disti_scene_painters(const dist_scene *scene, size_t n, const float *points, disti_scene_work *w)
+{
+    for (size_t i = 0; i < n; i++) {
+        if (w->choice[i] >= 0) continue;
+        w->choice[i] = w->winner[i];
+        w->lower[i] = 1.0f; /* outside */
+    }
+    disti_scene_sort(scene, n, points, w);
+}
+
+/* The color of that instance; with `back` its adjoint. */
 static void disti_scene_paint(const dist_scene *scene, int worker, size_t n, const float *points, float *color,
                               const disti_scene_pull *back)
 {
@@ -5186,12 +5219,7 @@ static void disti_scene_paint(const dist_scene *scene, int worker, size_t n, con
             if (pull.d_points) pull.d_points += 3 * at;
         }
         disti_scene_settle(scene, worker, count, points + 3 * at, &w, 0);
-        for (size_t i = 0; i < count; i++) {
-            if (w.choice[i] >= 0) continue;
-            w.choice[i] = w.winner[i];
-            w.lower[i] = 1.0f; /* outside */
-        }
-        disti_scene_sort(scene, count, points + 3 * at, &w);
+        disti_scene_painters(scene, count, points + 3 * at, &w);
         for (int k = 0; k < scene->count; k++) {
             const dist_field *field = &scene->placed[k].field;
             size_t first = (size_t)w.start[k], end = (size_t)w.start[k + 1];
@@ -5217,6 +5245,178 @@ static void disti_scene_color_adjoint(void *user, int worker, size_t n, const fl
     disti_scene_pull pull = {d_color, d_points, d_code, d_color_code};
     disti_scene_paint((const dist_scene *)user, worker, n, points, NULL, &pull);
 }
+
+#ifndef DIST_NO_TRAIN
+/* Where each instance's weights stand, each net's once: beside those of the first instance that has it. */
+static void disti_scene_lay(dist_scene *scene, int color)
+{
+    size_t total = 0;
+    for (int k = 0; k < scene->count; k++) {
+        disti_placed *placed = &scene->placed[k];
+        const dist_field *f = &placed->field;
+        const void *of = color ? f->color_weights_of : f->weights_of;
+        size_t count = color ? f->color_weight_count : f->weight_count;
+        int first = 0;
+        placed->weights[color] = total;
+        if (count == 0) continue;
+        for (; of && first < k; first++) {
+            const dist_field *other = &scene->placed[first].field;
+            if (of == (color ? other->color_weights_of : other->weights_of)) break;
+        }
+        if (of && first < k) placed->weights[color] = scene->placed[first].weights[color];
+        else if (!disti_size_add(total, count, &total) || total > (size_t)-1 / 16) break;
+    }
+    scene->weight_count[color] = total > (size_t)-1 / 16 ? 0 : total;
+}
+
+/* Which instance each of a chunk's points asks, as in a backward pass, in parallel: a part of worker 0's arrays to each
+   task, but for what is a worker's own. */
+typedef struct disti_scene_settling {
+    const dist_scene *scene;
+    disti_pieces pieces;
+    const float *points;
+} disti_scene_settling;
+
+static void disti_scene_settle_task(void *arg, int index, int worker)
+{
+    const disti_scene_settling *job = (const disti_scene_settling *)arg;
+    const dist_scene *scene = job->scene;
+    disti_scene_work w, all;
+    size_t first, n = disti_piece(&job->pieces, index, &first);
+    disti_scene_layout(scene, disti_scene_scratch(scene, worker), &w);
+    disti_scene_layout(scene, disti_scene_scratch(scene, 0), &all);
+    w.order = all.order + first;
+    w.local = all.local + 3 * first;
+    w.value = all.value + first;
+    w.choice = all.choice + first;
+    w.lower = all.lower + first;
+    w.best = all.best + first;
+    w.winner = all.winner + first;
+    w.asked = all.asked + first;
+    w.kept = all.kept + first;
+    w.nearest = all.nearest + first;
+    disti_scene_settle(scene, worker, n, job->points + 3 * first, &w, 0);
+}
+
+static void disti_scene_settle_all(const dist_scene *scene, size_t n, const float *points, disti_scene_work *w)
+{
+    disti_scene_settling job = {scene, disti_cut(n, 4 * DISTI_BLOCK, 1u << 20), points};
+    disti_run(scene->ctx, job.pieces.count, disti_scene_settle_task, &job);
+    disti_scene_layout(scene, disti_scene_scratch(scene, 0), w);
+}
+
+/* The chunk's seeds for a group's field, its first place in order. */
+typedef struct disti_scene_weighing {
+    const dist_scene *scene;
+    const disti_scene_work *work;
+    const float *d_sdf;
+    size_t group;
+} disti_scene_weighing;
+
+/* dist_seed_fn of a group whose values alone are known: those of disti_scene_seed. */
+static void disti_scene_weigh(void *user, size_t first, size_t count, const float *sdf, const float *gradient,
+                              float *d_sdf)
+{
+    const disti_scene_weighing *weighing = (const disti_scene_weighing *)user;
+    const disti_scene_work *w = weighing->work;
+    (void)gradient;
+    for (size_t j = 0; j < count; j++) {
+        size_t i = (size_t)w->order[weighing->group + first + j];
+        const disti_placed *placed = &weighing->scene->placed[w->choice[i]];
+        const disti_ball *ball = &weighing->scene->ball[w->choice[i]];
+        float f = disti_placed_value(placed, ball, w->lower[i], sdf[j]);
+        int hidden = disti_finite(f) && f >= w->best[i];
+        d_sdf[j] = hidden ? 0.0f : disti_placed_weight(placed, ball, w->lower[i], sdf[j]) * weighing->d_sdf[i];
+    }
+}
+
+/* The scene as far as its own backward passes have to know it. */
+static dist_field disti_scene_plain(dist_scene *scene)
+{
+    dist_field field;
+    memset(&field, 0, sizeof field);
+    field.user = scene;
+    field.eval_fn = disti_scene_eval;
+    field.fused_fn = disti_scene_fused;
+    field.color_fn = disti_scene_color;
+    field.color_adjoint_fn = disti_scene_color_adjoint;
+    field.code_size = (int)scene->code_size;
+    field.color_code_size = (int)scene->color_code_size;
+    return field;
+}
+
+/* dist_field.weights_fn of a scene: seeds, points and codes by a backward pass over all instances, then the weights
+   instance by instance. */
+static dist_status disti_scene_weights(void *user, dist_context *ctx, size_t n, const float *points, float *d_sdf,
+                                       dist_seed_fn seed_fn, void *seed_user, float *d_points, double *d_code,
+                                       float *d_weights)
+{
+    dist_scene *scene = (dist_scene *)user;
+    dist_field field = disti_scene_plain(scene);
+    dist_status status = DIST_OK;
+    disti_scene_work w;
+    if (seed_fn || d_points || d_code)
+        disti_field_backward_all(ctx, &field, n, points, d_sdf, seed_fn, seed_user, d_points, d_code);
+    for (size_t at = 0; at < n && status == DIST_OK; at += DISTI_SCENE_CHUNK) {
+        size_t count = DISTI_MIN(n - at, (size_t)DISTI_SCENE_CHUNK);
+        disti_scene_settle_all(scene, count, points + 3 * at, &w);
+        disti_scene_sort(scene, count, points + 3 * at, &w);
+        disti_scene_weighing weighing = {scene, &w, d_sdf + at, 0};
+        for (int k = 0; k < scene->count && status == DIST_OK; k++) {
+            const disti_placed *placed = &scene->placed[k];
+            const dist_field *f = &placed->field;
+            size_t asked = (size_t)w.start[k + 1] - (size_t)w.start[k];
+            weighing.group = (size_t)w.start[k];
+            if (asked == 0 || !f->weights_fn) continue;
+            *w.queries += (unsigned long long)asked;
+            status = f->weights_fn(f->user, ctx, asked, w.local + 3 * weighing.group, w.value + weighing.group,
+                                   disti_scene_weigh, &weighing, NULL, NULL, d_weights + placed->weights[0]);
+        }
+    }
+    return status;
+}
+
+/* 0: its color has no weights' gradient; 1: instances have colors of their own nets, 2: textures. */
+static int disti_scene_paints(const dist_scene *scene)
+{
+    int own = 1, textures = 1;
+    for (int k = 0; k < scene->count; k++) {
+        const dist_field *f = &scene->placed[k].field;
+        own = own && f->color_weights_fn && f->color_weight_count == 0;
+        textures = textures && f->color_weights_fn && f->color_weight_count > 0;
+    }
+    return own && scene->weight_count[0] > 0 ? 1 : textures && scene->weight_count[1] > 0 ? 2 : 0;
+}
+
+/* dist_field.color_weights_fn of a scene, likewise. */
+static void disti_scene_color_weights(void *user, dist_context *ctx, size_t n, const float *points,
+                                      const float *d_color, float *d_points, double *d_code, float *d_weights)
+{
+    dist_scene *scene = (dist_scene *)user;
+    dist_field field = disti_scene_plain(scene);
+    dist_gradients codes; /* wanted: added to d_code */
+    float wanted;
+    int textures = disti_scene_paints(scene) == 2;
+    disti_scene_work w;
+    memset(&codes, 0, sizeof codes);
+    if (d_code) codes.code = codes.color_code = &wanted;
+    disti_color_backward_all(ctx, &field, n, points, d_color, d_points, &codes, d_code);
+    for (size_t at = 0; at < n; at += DISTI_SCENE_CHUNK) {
+        size_t count = DISTI_MIN(n - at, (size_t)DISTI_SCENE_CHUNK);
+        disti_scene_settle_all(scene, count, points + 3 * at, &w);
+        disti_scene_painters(scene, count, points + 3 * at, &w);
+        for (size_t j = 0; j < count; j++)
+            memcpy(w.slope + 3 * j, d_color + 3 * (at + (size_t)w.order[j]), 3 * sizeof(float));
+        for (int k = 0; k < scene->count; k++) {
+            const disti_placed *placed = &scene->placed[k];
+            size_t first = (size_t)w.start[k], asked = (size_t)w.start[k + 1] - first;
+            if (asked > 0)
+                placed->field.color_weights_fn(placed->field.user, ctx, asked, w.local + 3 * first, w.slope + 3 * first,
+                                               NULL, NULL, d_weights + placed->weights[textures]);
+        }
+    }
+}
+#endif
 
 /* Whether the field asks this scene, itself or through other scenes. */
 static int disti_scene_within(const dist_scene *scene, const dist_field *field)
@@ -5299,6 +5499,9 @@ static dist_status disti_scene_place(dist_scene *scene, int k, const dist_instan
     scene->changes++;
     *placed = next;
     scene->ball[k] = ball;
+#ifndef DIST_NO_TRAIN
+    for (int color = 0; color < 2 && !create && instance->field; color++) disti_scene_lay(scene, color);
+#endif
     return DIST_OK;
 }
 
@@ -5370,6 +5573,9 @@ DIST_API dist_scene *dist_scene_create(dist_context *ctx, int count, const dist_
             goto fail;
         }
     }
+#ifndef DIST_NO_TRAIN
+    for (int color = 0; color < 2; color++) disti_scene_lay(scene, color);
+#endif
     if (disti_partial_for(ctx, scene->code_size + scene->color_code_size) == DIST_OK) return scene;
 fail:
     dist_scene_destroy(scene);
@@ -5415,10 +5621,14 @@ static unsigned disti_scene_changes(const dist_field *field)
 static int disti_scene_stale(const dist_field *field)
 {
     const dist_scene *scene = (const dist_scene *)field->user;
-    int stale = 0;
-    for (int k = 0; field->color_fn == disti_scene_color && k < scene->count; k++)
-        stale |= disti_stale(&scene->placed[k].field);
-    return stale;
+    int stale = 0, others = 0;
+    for (int k = 0; k < scene->count; k++) stale |= disti_stale(&scene->placed[k].field);
+    if (field->color_fn != disti_scene_color) stale &= ~1;
+#ifndef DIST_NO_TRAIN
+    others = field->weight_count != scene->weight_count[0];
+    others |= field->color_weight_count != (disti_scene_paints(scene) == 2 ? scene->weight_count[1] : 0);
+#endif
+    return others ? stale | 2 : stale;
 }
 
 DIST_API dist_field dist_scene_field(dist_scene *scene)
@@ -5438,6 +5648,13 @@ DIST_API dist_field dist_scene_field(dist_scene *scene)
     field.color_code_size = (int)scene->color_code_size;
     field.lipschitz = field.lipschitz_far = 1.0f; /* phi outside the spheres, however flat the instances are */
     field.radius = disti_scene_bound(scene, field.center);
+#ifndef DIST_NO_TRAIN
+    field.weight_count = scene->weight_count[0];
+    if (field.weight_count > 0) field.weights_fn = disti_scene_weights;
+    if (disti_scene_paints(scene)) field.color_weights_fn = disti_scene_color_weights;
+    if (disti_scene_paints(scene) == 2) field.color_weight_count = scene->weight_count[1];
+    field.weights_of = field.color_weights_of = scene;
+#endif
     int known = 1; /* what each instance costs */
     for (int k = 0; k < scene->count; k++) {
         const dist_field *f = &scene->placed[k].field;
@@ -5467,6 +5684,12 @@ DIST_API int dist_scene_offset(const dist_scene *scene, int index)
 {
     if (!scene || index < 0 || index > scene->count) return -1;
     return (int)(index < scene->count ? scene->placed[index].offset : scene->code_size);
+}
+
+DIST_API size_t dist_scene_weight_offset(const dist_scene *scene, int index, int color)
+{
+    if (!scene || index < 0 || index >= scene->count || color < 0 || color > 1) return (size_t)-1;
+    return scene->placed[index].weights[color];
 }
 
 DIST_API unsigned long long dist_scene_queries(const dist_scene *scene)
@@ -8201,7 +8424,11 @@ DIST_API dist_field dist_shape_field(dist_shape *shape)
     }
 #ifndef DIST_NO_TRAIN
     field.weight_count = net->param_count;
-    if (shape->texture) field.color_weight_count = shape->texture->net->param_count;
+    field.weights_of = net;
+    if (shape->texture) {
+        field.color_weight_count = shape->texture->net->param_count;
+        field.color_weights_of = shape->texture->net;
+    }
 #endif
     if (shape->texture) field.color_code_size = shape->texture->net->code_size - net->code_size;
     field.radius = net->bound;

@@ -423,6 +423,260 @@ TEST(gradients_for_points_codes_and_placements_are_those_of_double)
     dist_context_destroy(ctx);
 }
 
+static void seed_half(void *user, size_t first, size_t count, const float *sdf, const float *gradient, float *d_sdf)
+{
+    (void)sdf, (void)gradient;
+    for (size_t i = 0; i < count; i++) d_sdf[i] = 0.5f * ((const float *)user)[first + i];
+}
+
+/* Two instances of one net, one of another and a sphere: the nets' weights stand in the scene's once each. Against
+   differences of the definition in double. */
+TEST(gradients_for_weights_are_those_of_double_each_nets_once)
+{
+    enum { N = 300, TRIED = 24 };
+    static float points[3 * N], seeds[N], d_sdf[N], d_points[2][3 * N], d_code[2][200];
+    dist_context *ctx = test_context();
+    for (int which = 0; which < NETS; which++) {
+        model m[2];
+        dist_net *net[2];
+        world w;
+        test_random random = test_random_seed(61 + (unsigned)which);
+        double code[MODEL_CODE];
+        memset(&w, 0, sizeof w);
+        for (int i = 0; i < MODEL_CODE; i++) code[i] = 0.25;
+        for (int k = 0; k < 2; k++) {
+            m[k] = model_make(&nets[(which + k) % NETS], 70 + (unsigned)(which + k));
+            model_fit_ball(&m[k], code, 0.6);
+            net[k] = model_load(ctx, &m[k]);
+        }
+        w.ctx = ctx;
+        w.count = 4;
+        for (int k = 0; k < 4; k++)
+            w.part[k] = part_make(ctx, k == 2 ? SPHERE : NET, &m[k == 1], net[k == 1], &random);
+        part_place(&w.part[0], 0.7f, &random, -0.5f, 0.1f, 0.0f); /* it overlaps with the next */
+        part_place(&w.part[1], 1.3f, &random, 0.5f, -0.2f, 0.2f);
+        part_place(&w.part[2], 0.5f, &random, 0.2f, 1.6f, -0.1f);
+        part_place(&w.part[3], 0.8f, &random, -1.3f, -1.2f, 0.3f);
+        world_open(&w);
+        size_t count[2] = {dist_net_weight_count(net[0]), dist_net_weight_count(net[1])};
+        CHECK_EQUAL(count[0] + count[1], w.field.weight_count);
+        CHECK_EQUAL(0, dist_scene_weight_offset(w.scene, 0, 0));
+        CHECK_EQUAL(count[0], dist_scene_weight_offset(w.scene, 1, 0));
+        CHECK_EQUAL(0, dist_scene_weight_offset(w.scene, 3, 0));
+        CHECK_EQUAL((size_t)-1, dist_scene_weight_offset(w.scene, 4, 0));
+        int n = 0;
+        for (int tried = 0; n < N && tried < 20 * N; tried++) {
+            double p[3], margin;
+            near_points(&random, &w, 1 + tried % 4, 1.2, d_points[0]);
+            memcpy(points + 3 * n, d_points[0] + 3 * (tried % 4), 3 * sizeof(float));
+            point_of(points, n, p);
+            world_value(&w, p, 1, NULL, &margin);
+            n += margin > 1e-4;
+        }
+        REQUIRE(n == N);
+        test_random_fill(&random, N, seeds, -1.0f, 1.0f);
+        float *weights = (float *)calloc(3 * w.field.weight_count, sizeof(float));
+        REQUIRE(weights != NULL);
+        dist_gradients grads;
+        memset(&grads, 0, sizeof grads);
+        memset(d_points, 0, sizeof d_points);
+        memset(d_code, 0, sizeof d_code);
+        for (int run = 0; run < 3; run++) { /* with the codes and points, without, half of it by seed_fn */
+            grads.weights = weights + (size_t)run * w.field.weight_count;
+            grads.code = run == 0 ? d_code[0] : NULL;
+            memcpy(d_sdf, seeds, sizeof d_sdf);
+            CHECK_STATUS(DIST_OK,
+                         dist_field_backward(ctx, &w.field, N, points, d_sdf, run == 2 ? seed_half : NULL, seeds,
+                                             run == 0 ? d_points[0] : NULL, &grads), ctx);
+        }
+        for (int i = 0; i < N; i++) CHECK_NEAR(0.5 * (double)seeds[i], d_sdf[i], 0);
+        for (size_t i = 0; i < w.field.weight_count; i++) {
+            CHECK_NEAR((double)weights[i], weights[w.field.weight_count + i], 0);
+            CHECK_NEAR(0.5 * (double)weights[i], weights[2 * w.field.weight_count + i], 0);
+        }
+        grads.weights = NULL;
+        grads.code = d_code[1];
+        CHECK_STATUS(DIST_OK, dist_field_backward(ctx, &w.field, N, points, seeds, NULL, NULL, d_points[1], &grads),
+                     ctx);
+        CHECK_NEAR_ARRAY(3 * N, d_points[1], d_points[0], 0);
+        CHECK_NEAR_ARRAY(200, d_code[1], d_code[0], 1e-5);
+        double largest = 0, worst = 0;
+        for (size_t i = 0; i < w.field.weight_count; i++) largest = fmax(largest, fabs((double)weights[i]));
+        for (int t = 0; t < 2 * TRIED; t++) { /* the last are of the last layer */
+            int k = t % 2, last = (int)count[k] - 8;
+            int at = test_random_int(&random, t < TRIED ? 0 : last, (int)count[k] - 1);
+            double *x = &m[k].params[at], old = *x, sum = 0;
+            for (int i = 0; i < N; i++) {
+                double p[3], up;
+                point_of(points, i, p);
+                *x = old + 1e-6;
+                up = world_value(&w, p, 1, NULL, NULL);
+                *x = old - 1e-6;
+                sum += (double)seeds[i] * (up - world_value(&w, p, 1, NULL, NULL)) / 2e-6;
+            }
+            *x = old;
+            worst = fmax(worst, fabs(sum - (double)weights[(k ? count[0] : 0) + (size_t)at]));
+        }
+        if (test_state.verbose) printf("    %s: %.1e of %.3g\n", nets[which].name, worst, largest);
+        CHECK(largest > 1.0);
+        CHECK(worst < 2e-4 * largest);
+        free(weights);
+        world_close(&w);
+        for (int k = 0; k < 2; k++) {
+            dist_net_destroy(net[k]);
+            model_free(&m[k]);
+        }
+    }
+    dist_context_destroy(ctx);
+}
+
+/* Through pictures: of a scene of one, of a scene of it, and of that beside others that the camera does not see, the
+   gradient for the weights is the shape's own. Through points, of all that a net gives the color of. */
+TEST(weights_are_reached_through_pictures_colors_and_scenes_of_scenes)
+{
+    enum { S = 32, P = S * S, N = 200 };
+    static float seen[P], depth[P], normal[3 * P], color[3 * P];
+    static float d_depth[P], d_normal[3 * P], d_color[3 * P], points[3 * N];
+    static const model_desc own = {.name = "colored", .code_size = 2, .channels = "sdf,r,g,b", .clamp = 0.3};
+    static const model_desc paint = {.name = "texture", .code_size = 5, .channels = "r,g,b", .output = MODEL_SIGMOID};
+    dist_context *ctx = test_context();
+    for (int textured = 0; textured < 2; textured++) {
+        model m[2];
+        dist_net *net[2];
+        dist_shape *shape[2];
+        dist_field field[2];
+        dist_scene *scene[3];
+        dist_instance at[4];
+        float codes[2][3] = {{0.25f, 0.2f}, {0.2f, 0.3f}}, paints[3] = {0.3f, -0.2f, 0.4f};
+        double code[MODEL_CODE];
+        test_random random = test_random_seed(5);
+        for (int i = 0; i < MODEL_CODE; i++) code[i] = 0.25;
+        m[0] = model_make(&own, 5);
+        m[1] = model_make(&paint, 5);
+        model_fit_ball(&m[0], code, 0.6);
+        memset(at, 0, sizeof at);
+        for (int k = 0; k < 2; k++) net[k] = model_load(ctx, &m[k]);
+        for (int k = 0; k < 2; k++) {
+            shape[k] = dist_shape_create(ctx, net[0], codes[k]);
+            if (textured) CHECK_STATUS(DIST_OK, dist_shape_set_texture(shape[k], net[1], paints), ctx);
+            field[k] = dist_shape_field(shape[k]);
+        }
+        dist_field all[4] = {field[0]};
+        at[0].field = &all[0];
+        scene[0] = dist_scene_create(ctx, 1, at);
+        all[1] = dist_scene_field(scene[0]);
+        at[0].field = &all[1];
+        scene[1] = dist_scene_create(ctx, 1, at);
+        all[2] = dist_scene_field(scene[1]);
+        at[0].field = &field[0];
+        at[1].field = &field[1]; /* behind the camera */
+        at[1].placement.translation[2] = 40.0f;
+        scene[2] = dist_scene_create(ctx, 2, at);
+        all[3] = dist_scene_field(scene[2]);
+        size_t count = dist_net_weight_count(net[0]), colors = textured ? dist_net_weight_count(net[1]) : 0;
+        float *weights = (float *)calloc(4 * (count + colors), sizeof(float));
+        REQUIRE(weights != NULL);
+        float eye[3] = {0.3f, 0.4f, 2.2f}, up[3] = {0, 1, 0};
+        dist_camera camera = dist_camera_look_at(S, S, 0.8f, eye, NULL, up);
+        dist_render_desc how;
+        dist_images out, d_out;
+        memset(&how, 0, sizeof how);
+        memset(&out, 0, sizeof out);
+        memset(&d_out, 0, sizeof d_out);
+        how.normal_delta = 1e-3f;
+        how.epsilon = 1e-5f;
+        out.depth = depth, out.normal = normal, out.color = color;
+        d_out.depth = d_depth, d_out.normal = d_normal, d_out.color = d_color;
+        test_random_fill(&random, P, d_depth, -1.0f, 1.0f);
+        test_random_fill(&random, 3 * P, d_normal, -0.1f, 0.1f);
+        test_random_fill(&random, 3 * P, d_color, -1.0f, 1.0f);
+        int others = 0; /* pixels that show something else */
+        for (int k = 0; k < 4; k++) {
+            CHECK_STATUS(DIST_OK, dist_render(ctx, &all[k], &camera, &how, &out, NULL), ctx);
+            if (k == 0) memcpy(seen, depth, sizeof seen);
+            for (int i = 0; i < P; i++) others += fabs((double)depth[i] - (double)seen[i]) > 1e-5;
+        }
+        CHECK_EQUAL(0, others);
+        dist_tape *tape = dist_tape_create(ctx, &camera, &how);
+        for (int k = 0; k < 4; k++) {
+            float *to = weights + (size_t)k * (count + colors);
+            dist_gradients grads;
+            memset(&grads, 0, sizeof grads);
+            CHECK_EQUAL(count, all[k].weight_count);
+            CHECK_EQUAL(colors, all[k].color_weight_count);
+            grads.weights = to;
+            grads.color_weights = textured ? to + count : NULL;
+            CHECK_STATUS(DIST_OK, dist_render(ctx, &all[k], &camera, &how, &out, tape), ctx);
+            CHECK_STATUS(DIST_OK, dist_render_backward(ctx, tape, &d_out, &grads), ctx);
+            double square = 0, differ = 0, texture = 0, differ_texture = 0;
+            for (size_t i = 0; i < count + colors; i++) {
+                double a = (double)weights[i], b = (double)to[i] - a;
+                if (i < count) square += a * a, differ += b * b;
+                else texture += a * a, differ_texture += b * b;
+            }
+            if (test_state.verbose)
+                printf("    %d: %.1e of %.3g, %.1e of %.3g\n", k, sqrt(differ), sqrt(square), sqrt(differ_texture),
+                       sqrt(texture));
+            CHECK(square > 1.0 && differ < 1e-8 * square);
+            CHECK(!textured || (texture > 1.0 && differ_texture < 1e-8 * texture));
+        }
+        dist_tape_destroy(tape);
+        /* the second instance paints as well: what each adds by itself */
+        float shift[2] = {0, 40.0f}, *sum = weights, *got = weights + (count + colors);
+        dist_gradients grads;
+        memset(&grads, 0, sizeof grads);
+        memset(weights, 0, 2 * (count + colors) * sizeof(float));
+        for (int i = 0; i < N; i++) {
+            float direction[3];
+            test_random_direction(&random, direction);
+            for (int k = 0; k < 3; k++) points[3 * i + k] = 0.7f * direction[k];
+        }
+        for (int k = 0; k < 2; k++) {
+            *(textured ? &grads.color_weights : &grads.weights) = sum + (textured ? count : 0);
+            CHECK_STATUS(DIST_OK, dist_color_backward(ctx, &field[k], N / 2, points + k * 3 * (N / 2),
+                                                      d_color + k * 3 * (N / 2), NULL, &grads), ctx);
+            for (int i = 0; i < N / 2; i++) points[3 * (i + k * (N / 2)) + 2] += shift[k];
+        }
+        *(textured ? &grads.color_weights : &grads.weights) = got + (textured ? count : 0);
+        CHECK_STATUS(DIST_OK, dist_color_backward(ctx, &all[3], N, points, d_color, NULL, &grads), ctx);
+        double largest = 0, worst = 0;
+        for (size_t i = 0; i < count + colors; i++) {
+            largest = fmax(largest, fabs((double)sum[i]));
+            worst = fmax(worst, fabs((double)sum[i] - (double)got[i]));
+        }
+        CHECK(largest > 0.1 && worst < 1e-4 * largest);
+        /* a field with other weights in its place: the old one is refused, a new one is not */
+        model bigger = model_make(&nets[0], 3);
+        dist_net *other = model_load(ctx, &bigger);
+        dist_shape *shapes = dist_shape_create(ctx, other, codes[0]);
+        dist_field another = dist_shape_field(shapes);
+        at[1].field = &another;
+        another.color_fn = field[0].color_fn; /* never called: it has to have one */
+        another.color_adjoint_fn = field[0].color_adjoint_fn;
+        another.color_code_size = field[0].color_code_size;
+        CHECK_STATUS(DIST_OK, dist_scene_set(scene[2], 1, &at[1]), ctx);
+        memset(&grads, 0, sizeof grads);
+        grads.weights = got;
+        CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_backward(ctx, &all[3], N, points, d_color, NULL, NULL, NULL, &grads),
+                     ctx);
+        CHECK_TEXT("more or fewer weights since its field was taken", dist_context_message(ctx));
+        dist_context_clear(ctx);
+        CHECK_EQUAL(count + dist_net_weight_count(other), dist_scene_field(scene[2]).weight_count);
+        CHECK(dist_scene_field(scene[2]).color_weights_fn == NULL);
+        free(weights);
+        for (int k = 2; k >= 0; k--) dist_scene_destroy(scene[k]);
+        dist_shape_destroy(shapes);
+        dist_net_destroy(other);
+        model_free(&bigger);
+        for (int k = 0; k < 2; k++) dist_shape_destroy(shape[k]);
+        for (int k = 0; k < 2; k++) {
+            dist_net_destroy(net[k]);
+            model_free(&m[k]);
+        }
+    }
+    dist_context_destroy(ctx);
+}
+
 /* ---- pictures ---------------------------------------------------------------------------------------------------- */
 
 enum { SIDE = 96, PIXELS = SIDE * SIDE };
@@ -749,7 +1003,7 @@ TEST(a_scene_of_the_dearest_fields_is_not_refused)
 TEST(a_scene_has_the_same_bits_for_any_number_of_threads)
 {
     enum { N = 2500 };
-    static float points[3 * N], sdf[2][N], gradient[2][3 * N], d_code[2][100], seeds[N];
+    static float points[3 * N], sdf[2][N], gradient[2][3 * N], d_code[2][100], seeds[N], weights[2][4096];
     test_random random = test_random_seed(31);
     random_points(&random, N, 2.0, points);
     for (int i = 0; i < N; i++) seeds[i] = test_random_float(&random, -1, 1);
@@ -767,9 +1021,14 @@ TEST(a_scene_has_the_same_bits_for_any_number_of_threads)
         grads.code = d_code[run];
         CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &x.w.field, N, points, sdf[run], gradient[run]), ctx);
         CHECK_STATUS(DIST_OK, dist_field_backward(ctx, &x.w.field, N, points, seeds, NULL, NULL, NULL, &grads), ctx);
+        REQUIRE(x.w.field.weight_count <= 4096);
+        grads.code = NULL;
+        grads.weights = weights[run];
+        CHECK_STATUS(DIST_OK, dist_field_backward(ctx, &x.w.field, N, points, seeds, NULL, NULL, NULL, &grads), ctx);
         mixture_close(&x);
         dist_context_destroy(ctx);
     }
+    CHECK_BYTES(sizeof weights[0], weights[0], weights[1]);
     CHECK_BYTES(sizeof sdf[0], sdf[0], sdf[1]);
     CHECK_BYTES(sizeof gradient[0], gradient[0], gradient[1]);
     CHECK_BYTES(sizeof d_code[0], d_code[0], d_code[1]);
@@ -1639,6 +1898,8 @@ int main(int argc, char **argv)
     RUN(no_field_is_asked_outside_its_sphere);
     RUN(the_adjoint_of_a_placement_is_its_derivative_in_double);
     RUN(gradients_for_points_codes_and_placements_are_those_of_double);
+    RUN(gradients_for_weights_are_those_of_double_each_nets_once);
+    RUN(weights_are_reached_through_pictures_colors_and_scenes_of_scenes);
     RUN(a_scene_looks_like_the_union_that_asks_everything);
     RUN(a_scene_of_one_unmoved_instance_looks_like_its_field);
     RUN(a_small_instance_is_as_sharp_as_alone);

@@ -355,11 +355,11 @@ DIST_API dist_status dist_scene_set(dist_scene *scene, int index, const dist_ins
 /* The scene as a field. Borrows the scene. Its code is, for each instance, its field's code (nothing if that has no
    adjoint), then its placement as dist_similarity_move has it: log-scale, w of R' = exp([w]x) R, translation;
    dist_gradients.code gets the gradients for all of them, with the bounding spheres of scenes held where they are,
-   which matters outside of those alone. Its weights are those of the instances' nets, each net's once, in order of first
-   use (a scene in it: that scene's). It has a color if every instance has, with an adjoint if each has one; its color code
-   is theirs one after another, its color weights those of the textures, each texture's once; where only some instances
-   have a texture the weights of color get no gradient. The gradient of its normals is that of differences over
-   how.normal_delta, of smooth nets, too. */
+   which matters outside of those alone. Its weights are those of the instances' nets, each net's once, in order of
+   first use (a scene in it: that scene's). It has a color if every instance has, with an adjoint if each has one; its
+   color code is theirs one after another, its color weights those of the textures, each texture's once; where only
+   some instances have a texture the weights of color get no gradient. The gradient of its normals is that of
+   differences over how.normal_delta, of smooth nets, too. */
 DIST_API dist_field dist_scene_field(dist_scene *scene);
 /* Where instance `index` begins in the scene's code; its placement are the seven numbers before instance index + 1.
    index = count: all of them. -1 out of range. */

@@ -561,8 +561,9 @@ typedef struct dist_render_desc {
     float background_color[3];
     float lipschitz;     /* 0: the field's */
     float relax_band; /* above 0, with a tape: d_out's color beside the outline says where it is to go, by the rays that
-                         miss by less than this, shape units: one or two pixels' width. For losses that compare color
-                         without a mask; 0: off */
+                         miss by less than this, shape units: one or two pixels' width; too strongly, by about half the
+                         band over the outline's radius (the camera's distance, focal lengths: twice that). For losses
+                         that compare color without a mask; 0: off */
     int no_cones;        /* 1: every ray marches from the bounding sphere by itself */
     int no_prediction;   /* 1: no ray starts from what its neighbors found */
     int certified;       /* 1: only steps that the Lipschitz figures prove, field.certified where that is larger, for
@@ -5434,25 +5435,10 @@ static size_t disti_field_code(const dist_field *field)
     return field->adjoint_fn || field->fused_fn ? (size_t)field->code_size : 0;
 }
 
-/* Checks an instance and puts it in place k; create: there is none yet. */
-static dist_status disti_scene_place(dist_scene *scene, int k, const dist_instance *instance, int create,
-                                     const char *function)
+/* Checks a placement; m: its rotation, orthonormal. */
+static dist_status disti_placement_check(dist_context *ctx, const dist_similarity *s, const char *function, double m[9])
 {
-    dist_context *ctx = scene->ctx;
-    disti_placed *placed = &scene->placed[k], next = *placed;
-    const dist_similarity *s = &instance->placement;
-    double m[9], square = 0.0;
-    dist_status status = create || instance->field ? disti_field_check(ctx, instance->field, function) : DIST_OK;
-    if (status != DIST_OK) return status;
-    if (instance->field) next.field = *instance->field;
-    if (!create && disti_field_code(&next.field) != placed->code)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.code_size is %d, must stay what it was: %d", function,
-                          (double)disti_field_code(&next.field), (double)placed->code);
-    if (!create && (!next.field.color_fn != !placed->field.color_fn ||
-                    !next.field.color_adjoint_fn != !placed->field.color_adjoint_fn ||
-                    next.field.color_code_size != placed->field.color_code_size))
-        return disti_refuse(ctx, "%s: what the instance has of color must stay what it was", function);
-    if (disti_scene_within(scene, &next.field)) return disti_refuse(ctx, "%s: the field is this scene's own", function);
+    double square = 0.0;
     for (int i = 0; i < 13; i++) {
         float value = i == 0 ? s->scale : i < 10 ? s->rotation[i - 1] : s->translation[i - 10];
         if (!disti_finite(value))
@@ -5470,10 +5456,33 @@ static dist_status disti_scene_place(dist_scene *scene, int k, const dist_instan
         square += m[i] * m[i];
     }
     if (square == 0.0) m[0] = m[4] = m[8] = 1.0;
-    status = disti_rotation_check(ctx, m, "%s: placement.rotation is not a rotation (rows off orthonormal by %d, "
-                                          "determinant %d); see dist_similarity_move", function);
+    dist_status status = disti_rotation_check(ctx, m, "%s: placement.rotation is not a rotation (rows off orthonormal "
+                                                      "by %d, determinant %d); see dist_similarity_move", function);
+    if (status == DIST_OK) disti_orthonormalize(m);
+    return status;
+}
+
+/* Checks an instance and puts it in place k; create: there is none yet. */
+static dist_status disti_scene_place(dist_scene *scene, int k, const dist_instance *instance, int create,
+                                     const char *function)
+{
+    dist_context *ctx = scene->ctx;
+    disti_placed *placed = &scene->placed[k], next = *placed;
+    const dist_similarity *s = &instance->placement;
+    double m[9];
+    dist_status status = create || instance->field ? disti_field_check(ctx, instance->field, function) : DIST_OK;
     if (status != DIST_OK) return status;
-    disti_orthonormalize(m);
+    if (instance->field) next.field = *instance->field;
+    if (!create && disti_field_code(&next.field) != placed->code)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.code_size is %d, must stay what it was: %d", function,
+                          (double)disti_field_code(&next.field), (double)placed->code);
+    if (!create && (!next.field.color_fn != !placed->field.color_fn ||
+                    !next.field.color_adjoint_fn != !placed->field.color_adjoint_fn ||
+                    next.field.color_code_size != placed->field.color_code_size))
+        return disti_refuse(ctx, "%s: what the instance has of color must stay what it was", function);
+    if (disti_scene_within(scene, &next.field)) return disti_refuse(ctx, "%s: the field is this scene's own", function);
+    status = disti_placement_check(ctx, s, function, m);
+    if (status != DIST_OK) return status;
     next.scale = s->scale > 0.0f ? s->scale : 1.0f;
     next.inverse = 1.0f / next.scale;
     disti_ball ball;
@@ -15237,6 +15246,50 @@ static int disti_tile_outward(int across, int down, int index)
     return (y + (down - h) / 2) * across + x + (across - w) / 2;
 }
 
+/* A tile's rays by the guarded tracer. 0: none goes anywhere, and the planes are written. */
+static int disti_render_guarded(const disti_render_job *job, int worker, int index, disti_tile *tile,
+                                disti_bench *bench, disti_budget *budget)
+{
+    const disti_tracer *tracer = job->tracer;
+    int n = tile->width * tile->height, open = 1;
+    unsigned long long kept = job->least ? budget->left / 4 : 0; /* for the smallest f of misses */
+    budget->left -= kept;
+    for (int i = 0; i < DISTI_LEASTS; i++) bench->least_of->f[i] = 3e38f;
+    if (!tracer->how.no_cones)
+        open = disti_cones(tracer, worker, tile, bench, job->lattice ? job->lattice : (int)DISTI_CONE_LEAF,
+                           job->coned ? job->tape->cones + (size_t)index * (size_t)disti_tile_cones(job->tile) : NULL);
+    if (tile->lazy && job->out->stats) disti_render_meets(job, tile, bench->stats);
+    if (tile->lazy && !open) {
+        disti_render_empty(job, tile, bench);
+        return 0;
+    }
+    budget->marching = 1;
+    for (int i = 0; i < n && job->tape; i++) {
+        disti_ray *ray = &bench->rays[i];
+        ray->stop = ray->mode == DISTI_DONE && ray->enter < ray->leave ? ray->leave : ray->start; /* cleared */
+    }
+    float steepest = bench->stats->steepest;
+    bench->stats->steepest = 0.0f;
+    if (job->warm) bench->cones = 0; /* its memory is put to another use */
+    if (job->warm) disti_render_warm(job, worker, tile, bench);
+    open |= job->warm;
+    if (open && job->lattice) disti_trace_lattice(tracer, worker, tile, bench);
+    else if (open) disti_trace_all(tracer, worker, bench, (size_t)n);
+    int proven = tracer->how.certified && !(bench->stats->steepest > 0.0f);
+    bench->stats->steepest = DISTI_MAX(bench->stats->steepest, steepest);
+    if (open && (job->out->error || job->out->stats)) {
+        if (!proven) disti_trace_doubt(tracer, tile, bench);
+        if (disti_is_coarse(tracer->field)) disti_coarse_doubt(tracer, tile, bench);
+    }
+    budget->marching = 0;
+    disti_tile_trim(job, tile, bench);
+    disti_trace_end(tracer, bench, (size_t)(tile->width * tile->height));
+    budget->left += kept;
+    if (job->least) disti_silhouette(tracer, worker, tile, bench);
+    else if (job->tape && job->tape->value) disti_warm_seed(tile, bench);
+    return 1;
+}
+
 static void disti_render_task(void *arg, int index, int worker)
 {
     const disti_render_job *job = (const disti_render_job *)arg;
@@ -15254,8 +15307,6 @@ static void disti_render_task(void *arg, int index, int worker)
     int predict = job->lattice && !job->warm;
     if (predict && tile.x + tile.width < job->view->width) tile.width++;
     if (predict && tile.y + tile.height < job->view->height) tile.height++;
-    int n = tile.width * tile.height, open = 1;
-    unsigned long long met = bench.stats->rays_in_sphere;
     if (!tile.lazy) disti_tile_rays(tracer, &tile, &bench, 0, 0, tile.width, tile.height);
 #ifndef DIST_NO_PAPER
     if (tracer->how.trace == DIST_TRACE_PAPER) {
@@ -15264,45 +15315,8 @@ static void disti_render_task(void *arg, int index, int worker)
         disti_paper_trace(tracer, worker, &tile, &bench, samples, (size_t)job->view->width);
     } else
 #endif
-    {
-        unsigned long long kept = job->least ? budget.left / 4 : 0; /* for the smallest f of misses */
-        budget.left -= kept;
-        for (int i = 0; i < DISTI_LEASTS; i++) bench.least_of->f[i] = 3e38f;
-        if (!tracer->how.no_cones)
-            open = disti_cones(tracer, worker, &tile, &bench, job->lattice ? job->lattice : (int)DISTI_CONE_LEAF,
-                               job->coned ? job->tape->cones + (size_t)index * (size_t)disti_tile_cones(job->tile)
-                                          : NULL);
-        if (tile.lazy && job->out->stats) disti_render_meets(job, &tile, bench.stats);
-        met = bench.stats->rays_in_sphere;
-        if (tile.lazy && !open) {
-            disti_render_empty(job, &tile, &bench);
-            return;
-        }
-        budget.marching = 1;
-        for (int i = 0; i < n && job->tape; i++) {
-            disti_ray *ray = &bench.rays[i];
-            ray->stop = ray->mode == DISTI_DONE && ray->enter < ray->leave ? ray->leave : ray->start; /* cleared */
-        }
-        float steepest = bench.stats->steepest;
-        bench.stats->steepest = 0.0f;
-        if (job->warm) bench.cones = 0; /* its memory is put to another use */
-        if (job->warm) disti_render_warm(job, worker, &tile, &bench);
-        open |= job->warm;
-        if (open && job->lattice) disti_trace_lattice(tracer, worker, &tile, &bench);
-        else if (open) disti_trace_all(tracer, worker, &bench, (size_t)n);
-        int proven = tracer->how.certified && !(bench.stats->steepest > 0.0f);
-        bench.stats->steepest = DISTI_MAX(bench.stats->steepest, steepest);
-        if (open && (job->out->error || job->out->stats)) {
-            if (!proven) disti_trace_doubt(tracer, &tile, &bench);
-            if (disti_is_coarse(tracer->field)) disti_coarse_doubt(tracer, &tile, &bench);
-        }
-        budget.marching = 0;
-        disti_tile_trim(job, &tile, &bench);
-        disti_trace_end(tracer, &bench, (size_t)(tile.width * tile.height));
-        budget.left += kept;
-        if (job->least) disti_silhouette(tracer, worker, &tile, &bench);
-        else if (job->tape && job->tape->value) disti_warm_seed(&tile, &bench);
-    }
+    if (!disti_render_guarded(job, worker, index, &tile, &bench, &budget)) return;
+    unsigned long long met = bench.stats->rays_in_sphere;
     disti_render_planes(job, worker, &tile, &bench);
     if (tile.lazy) bench.stats->rays_in_sphere = met; /* planes counts only those that were made */
     if (job->cost) job->cost[index] = (unsigned)(bench.stats->queries - before);
@@ -15414,6 +15428,33 @@ static float disti_render_change(disti_tracer *tracer, const disti_view *view, d
     return count > 0 && disti_finite_double(sum) ? (float)(sum / (double)count) : 3e38f;
 }
 
+/* Whether out and tape go with the rest, which is checked. */
+static dist_status disti_render_check(const disti_tracer *tracer, const dist_camera *camera, const dist_images *out,
+                                      const dist_tape *tape, const char *name)
+{
+    dist_context *ctx = tracer->ctx;
+    const dist_render_desc *how = &tracer->how;
+    dist_status status = DIST_OK;
+    if (!out) return disti_refuse(ctx, "%s: out is NULL", name);
+    if (how->any_hit || how->max_distance > 0.0f)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT,
+                          how->any_hit ? "%s: how.any_hit is %d, must be 0: it is for dist_trace"
+                                       : "%s: how.max_distance is %d, must be 0: it is for dist_trace",
+                          name, how->any_hit ? 1.0 : (double)how->max_distance, 0);
+    if (out->color) status = disti_color_check(ctx, tracer->field, 0, name);
+    if (status != DIST_OK) return status;
+    if (tape && tape->ctx != ctx) return disti_refuse(ctx, "%s: tape belongs to another context", name);
+    if (tape && (tape->width != camera->width || tape->height != camera->height))
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: tape is for another size than camera.width %d, height %d", name,
+                          camera->width, camera->height);
+    if (how->warm_start && (!tape || !tape->value))
+        return disti_refuse(ctx, "dist_render: how.warm_start is 1, but tape is %s",
+                            tape ? "not made with it" : "NULL");
+    if (tape && (tape->trace != how->trace || (tape->sample && tape->samples != how->samples)))
+        return disti_refuse(ctx, "%s: tape was created with another trace or another number of samples", name);
+    return DIST_OK;
+}
+
 DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, const dist_camera *camera,
                                  const dist_render_desc *desc, const dist_images *out, dist_tape *tape)
 {
@@ -15425,24 +15466,8 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     if (status == DIST_OK) status = disti_field_check(ctx, field, name);
     if (status == DIST_OK) status = disti_camera_check(ctx, camera, name);
     if (status == DIST_OK) status = disti_tracer_init(&tracer, ctx, field, desc, name);
+    if (status == DIST_OK) status = disti_render_check(&tracer, camera, out, tape, name);
     if (status != DIST_OK) return status;
-    if (!out) return disti_refuse(ctx, "%s: out is NULL", name);
-    if (tracer.how.any_hit || tracer.how.max_distance > 0.0f)
-        return disti_fail(ctx, DIST_BAD_ARGUMENT,
-                          tracer.how.any_hit ? "%s: how.any_hit is %d, must be 0: it is for dist_trace"
-                                             : "%s: how.max_distance is %d, must be 0: it is for dist_trace",
-                          name, tracer.how.any_hit ? 1.0 : (double)tracer.how.max_distance, 0);
-    if (out->color) status = disti_color_check(ctx, field, 0, name);
-    if (status != DIST_OK) return status;
-    if (tape && tape->ctx != ctx) return disti_refuse(ctx, "%s: tape belongs to another context", name);
-    if (tape && (tape->width != camera->width || tape->height != camera->height))
-        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: tape is for another size than camera.width %d, height %d", name,
-                          camera->width, camera->height);
-    if (tracer.how.warm_start && (!tape || !tape->value))
-        return disti_refuse(ctx, "dist_render: how.warm_start is 1, but tape is %s",
-                            tape ? "not made with it" : "NULL");
-    if (tape && (tape->trace != tracer.how.trace || (tape->sample && tape->samples != tracer.how.samples)))
-        return disti_refuse(ctx, "%s: tape was created with another trace or another number of samples", name);
     disti_view_of(camera, &view);
     disti_stats_begin(ctx);
     job.tracer = &tracer;

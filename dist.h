@@ -542,7 +542,7 @@ enum {
 /* `how` in comments and messages. */
 typedef struct dist_render_desc {
     int max_steps; /* queries per ray at most, to 60000, and up to 40 more to where f has crossed 0 between two of them;
-                      0: 100 guarded, 10000 certified, 50 paper */
+                      0: 300 guarded, 10000 certified, 50 paper */
     float step_scale;    /* alpha, above 0, to 100; 0: 1.5 (paper: rows aggressive and coarse-to-fine) */
     float epsilon; /* largest |f| of a hit, shape units, which those interpolated between hits alike may exceed; 0: 5e-5
                       of the bounding radius or field.detail, or less where a pixel is smaller (paper: 5e-5). The
@@ -9961,7 +9961,7 @@ DIST_API dist_render_desc dist_render_desc_resolve(const dist_render_desc *desc)
     dist_render_desc how;
     memset(&how, 0, sizeof how);
     if (desc) how = *desc;
-    if (how.max_steps == 0) how.max_steps = how.trace == DIST_TRACE_PAPER ? 50 : how.certified ? 10000 : 100;
+    if (how.max_steps == 0) how.max_steps = how.trace == DIST_TRACE_PAPER ? 50 : how.certified ? 10000 : 300;
     if (how.step_scale == 0.0f) how.step_scale = 1.5f;
     if (how.epsilon == 0.0f && how.trace == DIST_TRACE_PAPER) how.epsilon = 5e-5f;
     if (how.samples == 0) how.samples = 1;
@@ -10536,7 +10536,9 @@ static int disti_ray_band(const disti_tracer *tracer, disti_ray *ray, disti_samp
         int ends = (ray->steps + 1 >= tracer->how.max_steps && flat) || zeros;
         return ends ? disti_ray_end(ray, DIST_RAY_PLATEAU, now.s, now.f, 0.0f) : disti_ray_feel(tracer, ray, epsilon);
     }
-    if (ray->side >= 16 && !(change >= 1e-3f * all)) return disti_ray_end(ray, DIST_RAY_PLATEAU, now.s, now.f, 0.0f);
+    float rise = now.f - fabsf(ray->fbest); /* past the least of a solid that was not met f is no plateau */
+    if (ray->side >= 16 && !(change >= 1e-3f * all) && !(rise > 1e-3f * (now.s - ray->best)))
+        return disti_ray_end(ray, DIST_RAY_PLATEAU, now.s, now.f, 0.0f);
     if (ray->side >= 16 && now.f <= tracer->noise)
         return disti_ray_end(ray, DIST_RAY_HIT, now.s, now.f, now.f * all / change);
     if (ray->side >= 48) return disti_ray_give_up(ray); /* it falls, but to where? */
@@ -10732,7 +10734,7 @@ static int disti_ray_marched(const disti_tracer *tracer, disti_ray *ray, disti_s
         (ray->side >= 8 || disti_ray_alone(tracer, ray, now, ray->b, 2e-3f)))
         return disti_ray_open_bracket(tracer, ray, now, ray->b);
     float gap = step - radius - disti_empty(tracer, fabsf(f)); /* what neither sphere covers */
-    if (tracer->how.certified) gap += 0.25f * tracer->noise / tracer->lipschitz; /* at a flat sheet spheres touch */
+    gap += 0.25f * tracer->noise / tracer->lipschitz; /* at a flat sheet spheres touch */
     float sphere = (tracer->how.certified ? 1.0f : 1.0001f) * radius + 4.8e-7f * tracer->field->radius;
     int back = ray->mode != DISTI_SKIP && step > sphere;
     float off = f - (ray->front.f + ray->slope * step);
@@ -12089,12 +12091,13 @@ typedef struct disti_foot_tour {
     int pass;
 } disti_foot_tour;
 
-/* Of a foot, how near something must be to be wanted; 0: no more is. */
+/* Of a foot, how near something must be to be wanted, 0: only what holds it; below 0: nothing is. */
 static float disti_foot_wants(const disti_foot *foot)
 {
     if (foot->status == DIST_RAY_UNRESOLVED) return foot->radius;
-    if (foot->status != DIST_RAY_HIT || (foot->sign < 0.0f && !(foot->doubt & DISTI_DOUBT_WITHIN))) return 0.0f;
-    return DISTI_MIN(foot->distance, foot->radius);
+    if (foot->status != DIST_RAY_HIT || (foot->sign < 0.0f && !(foot->doubt & DISTI_DOUBT_WITHIN))) return -1.0f;
+    float least = DISTI_MIN(foot->distance, foot->radius);
+    return least > 0.0f ? least : -1.0f;
 }
 
 /* Lists the feet that go into a sphere that holds the next so many leaves. */
@@ -12105,7 +12108,7 @@ static size_t disti_foot_list(disti_foot_tour *tour, const double center[3], dou
         disti_foot *foot = &tour->feet[i];
         float within = disti_foot_wants(foot);
         double d[3];
-        if (!(within > 0.0f)) continue;
+        if (within < 0.0f) continue;
         for (int k = 0; k < 3; k++) d[k] = (double)foot->p[k] - center[k];
         float away = (float)DISTI_MIN(sqrt(disti_dot(d, d)) - radius, 3e38);
         int first = foot->first >= tour->leaf && foot->first < tour->leaf + leaves;

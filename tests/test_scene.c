@@ -1861,6 +1861,37 @@ TEST(a_ball_that_is_grazed_hides_none_behind_it_in_a_large_scene)
 
 /* A ball and a wall so far apart that a step of float's smallest reaches the solid which a larger one had found: rays
    that touch the ball never ended (bounded by max_queries here, as nothing else did). */
+/* The third ball, which no ray comes near, makes for a small epsilon and so for a long way through the gap. */
+TEST(a_ball_that_is_passed_closely_hides_none_behind_it)
+{
+    float ball[3][4] = {{0, 0.5f, 0, 0.5f}, {0, 0, 1, 0.45f}, {2, 0, 0, 0.03f}};
+    dist_context *ctx = test_context();
+    dist_field field[3];
+    dist_instance at[3];
+    memset(at, 0, sizeof at);
+    for (int i = 0; i < 3; i++) {
+        field[i] = dist_field_sphere(ball[i]);
+        at[i].field = &field[i];
+    }
+    dist_scene *scene = dist_scene_create(ctx, 3, at);
+    dist_field all = dist_scene_field(scene);
+    for (int i = 0; i <= 100; i++) {
+        double gap = pow(10, -6 + 0.05 * i);
+        float o[3] = {0, (float)-gap, -3}, d[3] = {0, 0, 1};
+        dist_hit hit;
+        for (int more = 0; more < 2; more++) {
+            dist_render_desc how;
+            memset(&how, 0, sizeof how);
+            how.max_steps = more ? 2000 : 0;
+            CHECK_STATUS(DIST_OK, dist_trace(ctx, &all, 1, o, d, &how, &hit, NULL), ctx);
+            CHECK_EQUAL(DIST_RAY_HIT, hit.status);
+            CHECK_NEAR(4 - sqrt(0.45 * 0.45 - gap * gap), hit.distance, (double)hit.error + 1e-5);
+        }
+    }
+    dist_scene_destroy(scene);
+    dist_context_destroy(ctx);
+}
+
 TEST(certified_rays_that_touch_a_small_ball_in_a_large_scene_end)
 {
     const float ball[4] = {0, 0, 0, 0.03f}, wall[4] = {0, 0, -501, 500};
@@ -1922,6 +1953,7 @@ int main(int argc, char **argv)
     RUN(only_create_takes_memory_and_a_failed_one_leaves_none);
     RUN(no_ray_steps_over_an_instance_that_is_small_beside_the_scene);
     RUN(a_ball_that_is_grazed_hides_none_behind_it_in_a_large_scene);
+    RUN(a_ball_that_is_passed_closely_hides_none_behind_it);
     RUN(certified_rays_that_touch_a_small_ball_in_a_large_scene_end);
     return test_report();
 }

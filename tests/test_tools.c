@@ -712,12 +712,21 @@ TEST(closest_points_of_fields_without_an_inside_are_found)
 TEST(a_sphere_without_a_radius_is_a_point)
 {
     dist_context *ctx = shape_context();
-    const float ball[4] = {0, 0, 0, 0.5f}, at[8] = {0.1f, 0, 0, 0, 0.7f, 0, 0, 0};
-    dist_field field = dist_field_sphere(ball);
-    CHECK_STATUS(DIST_OK, dist_field_collide(ctx, &field, 2, at, contacts), ctx);
-    CHECK_EQUAL(DIST_RAY_HIT, contacts[0].status);
-    CHECK_NEAR(0.4, contacts[0].depth, 1e-5);
-    CHECK_EQUAL(DIST_RAY_MISS, contacts[1].status);
+    const float ball[4] = {0, 0, 0, 0.5f}, far[4] = {3, 0, 0, 0.5f}, at[8] = {0.1f, 0, 0, 0, 0.7f, 0, 0, 0};
+    dist_field field[3] = {dist_field_sphere(ball), dist_field_sphere(far)};
+    dist_instance instances[2];
+    memset(instances, 0, sizeof instances);
+    for (int k = 0; k < 2; k++) instances[k].field = &field[k];
+    for (int count = 0; count < 3; count++) { /* by itself, then in scenes */
+        dist_scene *scene = count > 0 ? dist_scene_create(ctx, count, instances) : NULL;
+        field[2] = scene ? dist_scene_field(scene) : field[0];
+        CHECK_STATUS(DIST_OK, dist_field_collide(ctx, &field[2], 2, at, contacts), ctx);
+        CHECK_EQUAL(DIST_RAY_HIT, contacts[0].status);
+        CHECK_NEAR(0.4, contacts[0].depth, 1e-5);
+        CHECK_EQUAL(DIST_RAY_MISS, contacts[1].status);
+        CHECK(contacts[1].depth <= -0.15f && contacts[1].depth >= -0.2f - 1e-5f);
+        dist_scene_destroy(scene);
+    }
     dist_context_destroy(ctx);
 }
 

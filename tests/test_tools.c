@@ -724,7 +724,7 @@ TEST(a_sphere_without_a_radius_is_a_point)
         CHECK_EQUAL(DIST_RAY_HIT, contacts[0].status);
         CHECK_NEAR(0.4, contacts[0].depth, 1e-5);
         CHECK_EQUAL(DIST_RAY_MISS, contacts[1].status);
-        CHECK(contacts[1].depth <= -0.15f && contacts[1].depth >= -0.2f - 1e-5f);
+        CHECK(contacts[1].depth <= -0.1f && contacts[1].depth >= -0.2f - 1e-5f);
         dist_scene_destroy(scene);
     }
     dist_context_destroy(ctx);

@@ -5248,7 +5248,7 @@ static void disti_scene_color_adjoint(void *user, int worker, size_t n, const fl
 }
 
 #ifndef DIST_NO_TRAIN
-/* Where each instance's weights stand, each net's once: beside those of the first instance that has it. */
+/* Where each instance's weights stand, each net's once: where those of the last instance before it do that has it. */
 static void disti_scene_lay(dist_scene *scene, int color)
 {
     size_t total = 0;
@@ -5257,14 +5257,14 @@ static void disti_scene_lay(dist_scene *scene, int color)
         const dist_field *f = &placed->field;
         const void *of = color ? f->color_weights_of : f->weights_of;
         size_t count = color ? f->color_weight_count : f->weight_count;
-        int first = 0;
+        int last = of ? k - 1 : -1;
         placed->weights[color] = total;
         if (count == 0) continue;
-        for (; of && first < k; first++) {
-            const dist_field *other = &scene->placed[first].field;
+        for (; last >= 0; last--) {
+            const dist_field *other = &scene->placed[last].field;
             if (of == (color ? other->color_weights_of : other->weights_of)) break;
         }
-        if (of && first < k) placed->weights[color] = scene->placed[first].weights[color];
+        if (last >= 0) placed->weights[color] = scene->placed[last].weights[color];
         else if (!disti_size_add(total, count, &total) || total > (size_t)-1 / 16) break;
     }
     scene->weight_count[color] = total > (size_t)-1 / 16 ? 0 : total;

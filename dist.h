@@ -5247,6 +5247,21 @@ static void disti_scene_color_adjoint(void *user, int worker, size_t n, const fl
     disti_scene_paint((const dist_scene *)user, worker, n, points, NULL, &pull);
 }
 
+/* The scene as far as its own backward passes have to know it. */
+static dist_field disti_scene_plain(dist_scene *scene)
+{
+    dist_field field;
+    memset(&field, 0, sizeof field);
+    field.user = scene;
+    field.eval_fn = disti_scene_eval;
+    field.fused_fn = disti_scene_fused;
+    field.color_fn = disti_scene_color;
+    field.color_adjoint_fn = disti_scene_color_adjoint;
+    field.code_size = (int)scene->code_size;
+    field.color_code_size = (int)scene->color_code_size;
+    return field;
+}
+
 #ifndef DIST_NO_TRAIN
 /* Where each instance's weights stand, each net's once: where those of the last instance before it do that has it. */
 static void disti_scene_lay(dist_scene *scene, int color)
@@ -5329,21 +5344,6 @@ static void disti_scene_weigh(void *user, size_t first, size_t count, const floa
         int hidden = disti_finite(f) && f >= w->best[i];
         d_sdf[j] = hidden ? 0.0f : disti_placed_weight(placed, ball, w->lower[i], sdf[j]) * weighing->d_sdf[i];
     }
-}
-
-/* The scene as far as its own backward passes have to know it. */
-static dist_field disti_scene_plain(dist_scene *scene)
-{
-    dist_field field;
-    memset(&field, 0, sizeof field);
-    field.user = scene;
-    field.eval_fn = disti_scene_eval;
-    field.fused_fn = disti_scene_fused;
-    field.color_fn = disti_scene_color;
-    field.color_adjoint_fn = disti_scene_color_adjoint;
-    field.code_size = (int)scene->code_size;
-    field.color_code_size = (int)scene->color_code_size;
-    return field;
 }
 
 /* dist_field.weights_fn of a scene: seeds, points and codes by a backward pass over all instances, then the weights
@@ -5645,16 +5645,10 @@ DIST_API dist_field dist_scene_field(dist_scene *scene)
     dist_field field;
     memset(&field, 0, sizeof field);
     if (!scene) return field;
-    field.user = scene;
+    field = disti_scene_plain(scene);
     field.owner = scene->ctx;
     field.changes_fn = disti_scene_changes;
     field.stale_fn = disti_scene_stale;
-    field.eval_fn = disti_scene_eval;
-    field.fused_fn = disti_scene_fused;
-    field.color_fn = disti_scene_color;
-    field.color_adjoint_fn = disti_scene_color_adjoint;
-    field.code_size = (int)scene->code_size;
-    field.color_code_size = (int)scene->color_code_size;
     field.lipschitz = field.lipschitz_far = 1.0f; /* phi outside the spheres, however flat the instances are */
     field.radius = disti_scene_bound(scene, field.center);
 #ifndef DIST_NO_TRAIN

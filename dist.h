@@ -10625,8 +10625,9 @@ static int disti_ray_predicted(const disti_tracer *tracer, disti_ray *ray, disti
 static int disti_ray_arrive(const disti_tracer *tracer, disti_ray *ray)
 {
     if (ray->b.f < 0.0f && ray->b.s > ray->front.s) { /* what is near need not be what is at b */
-        if (!disti_ray_alone(tracer, ray, ray->front, ray->b, 2e-3f)) return disti_ray_step(tracer, ray);
-        return disti_ray_open_bracket(tracer, ray, ray->front, ray->b);
+        if (disti_ray_alone(tracer, ray, ray->front, ray->b, 2e-3f))
+            return disti_ray_open_bracket(tracer, ray, ray->front, ray->b);
+        if (tracer->how.certified) return disti_ray_step(tracer, ray);
     }
     float epsilon = disti_ray_near(tracer, ray, ray->front.s);
     ray->side = 0;
@@ -10724,9 +10725,13 @@ static void disti_ray_move(const disti_tracer *tracer, disti_ray *ray, disti_sam
 static int disti_ray_marched(const disti_tracer *tracer, disti_ray *ray, disti_sample now)
 {
     float f = now.f, radius = disti_empty(tracer, ray->front.f), step = now.s - ray->front.s;
-    if (ray->b.f < 0.0f && f > 0.0f && now.s < ray->b.s && ++ray->side >= 3 && !tracer->how.certified &&
-        (ray->side >= 8 || disti_ray_alone(tracer, ray, now, ray->b, 2e-3f)))
-        return disti_ray_open_bracket(tracer, ray, now, ray->b);
+    if (ray->b.f < 0.0f && f > 0.0f && now.s < ray->b.s && ++ray->side >= 3 && !tracer->how.certified) {
+        float slope = (f - ray->front.f) / step, mean = (ray->b.f - f) / (ray->b.s - now.s);
+        int steep = slope < -0.05f * tracer->lipschitz, straight = !steep && fabsf(mean - slope) <= -0.1f * mean;
+        if (straight || disti_ray_alone(tracer, ray, now, ray->b, 2e-3f))
+            return disti_ray_open_bracket(tracer, ray, now, ray->b);
+        if (steep) ray->b.f = 0.0f; /* what is near may be another solid: on as if b were not known, with jumps again */
+    }
     float gap = step - radius - disti_empty(tracer, fabsf(f)); /* what neither sphere covers */
     gap += 0.25f * tracer->noise / tracer->lipschitz; /* at a flat sheet spheres touch */
     float sphere = (tracer->how.certified ? 1.0f : 1.0001f) * radius + 4.8e-7f * tracer->field->radius;

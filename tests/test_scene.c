@@ -1859,6 +1859,69 @@ TEST(a_ball_that_is_grazed_hides_none_behind_it_in_a_large_scene)
     dist_context_destroy(ctx);
 }
 
+/* Rays that stepped too far, into a ball, and then came down to another before it: a bracket between the two lost the
+   nearer one of one hit in 15,000, for one farther on with a bound of 1e-5. The truth in double. */
+TEST(no_ball_is_passed_for_one_behind_it_that_a_step_found)
+{
+    enum { MOST = 12, RAYS = 20000 };
+    static float origins[3 * RAYS], directions[3 * RAYS];
+    static dist_hit hits[RAYS];
+    dist_context *ctx = test_context();
+    int seen = 0, lost = 0, scenes = test_quick() ? 20 : 100;
+    for (int k = 0; k < scenes; k++) {
+        float ball[MOST][4];
+        dist_field field[MOST];
+        dist_instance at[MOST];
+        test_random random = test_random_seed((unsigned)k + 1);
+        int n = 2 + (int)test_random_float(&random, 0.0f, 10.99f);
+        memset(at, 0, sizeof at);
+        for (int i = 0; i < n; i++) {
+            test_random_fill(&random, 3, ball[i], -1.0f, 1.0f);
+            ball[i][3] = 0.05f + 0.6f * test_random_float(&random, 0, 1) * test_random_float(&random, 0, 1);
+            field[i] = dist_field_sphere(ball[i]);
+            at[i].field = &field[i];
+        }
+        dist_scene *scene = dist_scene_create(ctx, n, at);
+        dist_field all = dist_scene_field(scene);
+        for (int i = 0; i < RAYS; i++) {
+            float away = test_random_float(&random, 2, 5);
+            test_random_direction(&random, origins + 3 * i);
+            for (int j = 0; j < 3; j++) {
+                origins[3 * i + j] *= away;
+                directions[3 * i + j] = test_random_float(&random, -1, 1) - origins[3 * i + j];
+            }
+        }
+        CHECK_STATUS(DIST_OK, dist_trace(ctx, &all, RAYS, origins, directions, NULL, hits, NULL), ctx);
+        for (int i = 0; i < RAYS; i++) {
+            double nearest = 1e9, deep = 0.0, radius = 1.0, length = 0.0, along[MOST], square[MOST];
+            int inside = 0;
+            for (int j = 0; j < 3; j++) length += (double)directions[3 * i + j] * (double)directions[3 * i + j];
+            for (int m = 0; m < n; m++) {
+                along[m] = square[m] = 0.0;
+                for (int j = 0; j < 3; j++) {
+                    double v = (double)ball[m][j] - (double)origins[3 * i + j];
+                    along[m] += v * (double)directions[3 * i + j] / sqrt(length);
+                    square[m] += v * v;
+                }
+                double r = (double)ball[m][3], aside = square[m] - along[m] * along[m];
+                inside |= square[m] <= r * r;
+                if (along[m] < 0.0 || aside >= r * r || along[m] - sqrt(r * r - aside) >= nearest) continue;
+                nearest = along[m] - sqrt(r * r - aside);
+                radius = r;
+                deep = r - sqrt(fmax(aside, 0.0));
+            }
+            if (inside || nearest > 1e8 || deep < 1e-6) continue;
+            seen++;
+            lost += hits[i].status != DIST_RAY_HIT ||
+                    (double)hits[i].distance > nearest + 1e-3 * radius + 3.0 * sqrt(2.0 * deep * radius);
+        }
+        dist_scene_destroy(scene);
+    }
+    CHECK(seen > 3000 * scenes);
+    CHECK_EQUAL(0, lost);
+    dist_context_destroy(ctx);
+}
+
 /* A ball and a wall so far apart that a step of float's smallest reaches the solid which a larger one had found: rays
    that touch the ball never ended (bounded by max_queries here, as nothing else did). */
 /* The third ball, which no ray comes near, makes for a small epsilon and so for a long way through the gap. */
@@ -1953,6 +2016,7 @@ int main(int argc, char **argv)
     RUN(only_create_takes_memory_and_a_failed_one_leaves_none);
     RUN(no_ray_steps_over_an_instance_that_is_small_beside_the_scene);
     RUN(a_ball_that_is_grazed_hides_none_behind_it_in_a_large_scene);
+    RUN(no_ball_is_passed_for_one_behind_it_that_a_step_found);
     RUN(a_ball_that_is_passed_closely_hides_none_behind_it);
     RUN(certified_rays_that_touch_a_small_ball_in_a_large_scene_end);
     return test_report();

@@ -1112,7 +1112,7 @@ static float disti_within_float(double x)
 }
 
 /* *to += x within float's range; what is not finite adds nothing. */
-DISTI_UNUSED static void disti_add_gradient(float *to, double x)
+static void disti_add_within(float *to, double x)
 {
     double sum = (double)*to + x;
     if (disti_finite_double(sum)) *to = disti_within_float(sum);
@@ -4578,9 +4578,9 @@ static dist_status disti_gradients_plain(dist_context *ctx, const dist_field *fi
 /* total: of the code, then of the color's code. */
 static void disti_codes_add(const dist_field *field, const dist_gradients *grads, const double *total)
 {
-    for (int j = 0; grads->code && j < field->code_size; j++) disti_add_gradient(&grads->code[j], total[j]);
+    for (int j = 0; grads->code && j < field->code_size; j++) disti_add_within(&grads->code[j], total[j]);
     for (int j = 0; grads->color_code && j < field->color_code_size; j++)
-        disti_add_gradient(&grads->color_code[j], total[field->code_size + j]);
+        disti_add_within(&grads->color_code[j], total[field->code_size + j]);
 }
 
 DIST_API dist_status dist_color_backward(dist_context *ctx, const dist_field *field, size_t n, const float *points,
@@ -5747,10 +5747,10 @@ DIST_API void dist_similarity_move(dist_similarity *placement, const float step[
     if (placement->scale == 0.0f) placement->scale = 1.0f;
     if (memcmp(placement->rotation, zero, sizeof zero) == 0)
         placement->rotation[0] = placement->rotation[4] = placement->rotation[8] = 1.0f;
-    double scale = (double)placement->scale * exp((double)step[0]);
+    double scale = (double)placement->scale * exp(DISTI_MIN(DISTI_MAX((double)step[0], -200.0), 200.0));
     if (placement->scale > 0.0f) placement->scale = (float)(scale < 1e-30 ? 1e-30 : scale > 1e30 ? 1e30 : scale);
     disti_turn(step + 1, placement->rotation);
-    for (int i = 0; i < 3; i++) placement->translation[i] += step[4 + i];
+    for (int i = 0; i < 3; i++) disti_add_within(&placement->translation[i], (double)step[4 + i]);
 }
 
 /*@ 05 net ---------------------------------------------------------------------------------------------------------- */
@@ -8198,7 +8198,7 @@ static void disti_weights_task(void *arg, int index, int worker)
     for (size_t i = 0; i < count; i++) {
         float *to = job->d_weights + layer->weight + (row + i) * (size_t)layer->in + layer->code_column;
         for (size_t j = 0; j < (size_t)layer->code; j++)
-            disti_add_gradient(&to[j], (double)layer->scale * total[i] * (double)shape->code[j]);
+            disti_add_within(&to[j], (double)layer->scale * total[i] * (double)shape->code[j]);
     }
 }
 
@@ -9869,7 +9869,7 @@ DIST_API void dist_camera_move(dist_camera *camera, const float w[3], const floa
 {
     if (!camera || (w && !disti_finite_all(3, w)) || (t && !disti_finite_all(3, t))) return;
     if (w) disti_turn(w, camera->rotation);
-    for (int i = 0; t && i < 3; i++) camera->translation[i] += t[i];
+    for (int i = 0; t && i < 3; i++) disti_add_within(&camera->translation[i], (double)t[i]);
 }
 
 DIST_API void dist_camera_ray(const dist_camera *camera, float x, float y, float origin[3], float direction[3])
@@ -15989,10 +15989,10 @@ DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *ta
     disti_float_state_leave(state);
     disti_codes_add(&tape->field, grads, job.total);
     for (int i = 0; i < 3; i++) {
-        if (grads->rotation) disti_add_gradient(&grads->rotation[i], job.rotation[i]);
-        if (grads->translation) disti_add_gradient(&grads->translation[i], job.translation[i]);
-        if (grads->focal && i < 2) disti_add_gradient(&grads->focal[i], job.focal[i]);
-        if (grads->principal && i < 2) disti_add_gradient(&grads->principal[i], job.principal[i]);
+        if (grads->rotation) disti_add_within(&grads->rotation[i], job.rotation[i]);
+        if (grads->translation) disti_add_within(&grads->translation[i], job.translation[i]);
+        if (grads->focal && i < 2) disti_add_within(&grads->focal[i], job.focal[i]);
+        if (grads->principal && i < 2) disti_add_within(&grads->principal[i], job.principal[i]);
     }
     if (d_out->stats) {
         d_out->stats->capped += job.capped;
@@ -16141,7 +16141,7 @@ DIST_API float dist_loss_code(size_t n, const float *code, float weight, float *
     for (size_t j = 0; j < n; j++) {
         if (!disti_finite(code[j])) continue;
         sum += (double)code[j] * (double)code[j];
-        if (d_code) disti_add_gradient(&d_code[j], 2.0 * (double)weight * (double)code[j]);
+        if (d_code) disti_add_within(&d_code[j], 2.0 * (double)weight * (double)code[j]);
     }
     return disti_within_float((double)weight * sum);
 }
@@ -16379,7 +16379,7 @@ DIST_API float dist_loss_photometric(const dist_photo *to, const dist_photo *fro
     if (d_depth || d_cameras) {
         memset(d_pose, 0, sizeof d_pose);
         disti_warp_sweep(&pair, NULL, scale, again, d_depth, d_pose);
-        for (int i = 0; d_cameras && i < 12; i++) disti_add_gradient(&d_cameras[i], d_pose[i]);
+        for (int i = 0; d_cameras && i < 12; i++) disti_add_within(&d_cameras[i], d_pose[i]);
     }
     return disti_within_float(scale[0] * sum[0] + scale[1] * sum[2]);
 }

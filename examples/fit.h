@@ -315,10 +315,10 @@ static inline double chamfer_between(dist_context *ctx, const float *a, const fl
     return chamfer;
 }
 
-/* A word at the end of a fit that has found nothing better than its start. */
+/* A word at the end of a fit that has found nothing better than its start, if that was not the truth to the last bits. */
 static inline void tell_if_not_fallen(double start, double end, double rate)
 {
-    if (!(end < start)) { printf("the loss has not fallen: try a --rate below %g, or another start\n", rate); }
+    if (!(end < start) && !(end < 1e-5)) { printf("the loss has not fallen: try a --rate below %g, or another start\n", rate); }
 }
 
 static inline void json_score(json *j, const char *name, const char *when, double value)

@@ -315,17 +315,27 @@ static void fit_and_report(fit *f, const float *target_points, const size_t *byt
     progress p = progress_begin("measuring the surfaces");
     progress_show(&p, 0, 1, NULL, 0);
     scores[0] = fit_score(f, path, target_points, terms, NULL);
-    scores[1] = fit_score(f, path + steps * f->code_size, target_points, loss + 4 * steps + 1, &mesh);
-    loss[4 * steps] = scores[1].loss;
+    size_t best = steps;
+    for (;;) { /* a fit that ends above its start is taken back to where it was best */
+        float *result = path + steps * f->code_size;
+        memmove(result, path + best * f->code_size, f->code_size * sizeof *path);
+        scores[1] = fit_score(f, result, target_points, loss + 4 * steps + 1, &mesh);
+        loss[4 * steps] = scores[1].loss;
+        if (best < steps || !(scores[1].loss > scores[0].loss)) { break; }
+        best = 0;
+        for (size_t i = 1; i < steps; i++) { best = loss[4 * i] < loss[4 * best] ? i : best; }
+        dist_mesh_destroy(mesh);
+    }
     progress_end(&p);
+    if (best < steps) { printf("the loss went up: the result is that of step %.0f, the best\n", (double)best); }
 
     char name[PATH_SIZE];
-    write_strip(f, path);
-    write_loss(o, loss);
+    write_report(f, scores, &total, seconds); /* the code first: what comes after may find the disk full */
     dist_mesh_save(f->ctx, mesh, path_of(name, o->out, ".ply"));
     check(f->ctx);
     printf("%s\n", name);
-    write_report(f, scores, &total, seconds);
+    write_loss(o, loss);
+    write_strip(f, path);
     printf("%d steps, %llu queries, %.2f seconds\n", o->iterations, total.queries, seconds);
     print_row("loss", scores[0].loss, scores[1].loss);
     print_row("depth error", scores[0].depth_error, scores[1].depth_error);

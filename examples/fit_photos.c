@@ -82,6 +82,7 @@ typedef struct fit {
     float *target_points; /* on the true surface; NULL: not known */
     dist_render_desc how;
     unsigned long long queries;
+    size_t compared; /* pixels that the last loss is a mean over: both photos of a pair show what is there */
 } fit;
 
 /* Makes f->field the shape of this code in this place. */
@@ -430,6 +431,7 @@ static double fit_loss(fit *f, int count, int (*pairs)[2], double terms[2])
     dist_mesh *mesh = NULL;
     memset(&desc, 0, sizeof desc);
     desc.ssim = o->ssim;
+    f->compared = 0;
     memset(f->d_code, 0, (f->code_size + 7) * sizeof(float));
     for (size_t i = 0; i < f->view_count; i++) { f->views[i].used = 0; }
     for (int k = 0; k < count; k++) { f->views[pairs[k][0]].used = f->views[pairs[k][1]].used = 1; }
@@ -447,8 +449,11 @@ static double fit_loss(fit *f, int count, int (*pairs)[2], double terms[2])
         view_data *v = &f->views[pairs[k / 2][k % 2]];
         dist_photo to = photo_of(v);
         dist_photo from = photo_of(&f->views[pairs[k / 2][1 - k % 2]]);
+        desc.visible = (unsigned char *)take(pixel_count(v), 1);
         terms[0] += (double)dist_loss_photometric(&to, &from, &desc, o->weights[0] / (float)(2 * count), v->d_depth,
                                                   NULL);
+        for (size_t i = 0; i < pixel_count(v); i++) { f->compared += desc.visible[i]; }
+        free(desc.visible);
     }
     views_backward(f, mesh);
     dist_mesh_destroy(mesh);
@@ -462,6 +467,18 @@ static void blur_photos(fit *f, float sigma)
         view_data *v = &f->views[i];
         blur(v->camera.width, v->camera.height, v->photo, sigma, v->color);
     }
+}
+
+/* A step too long can blow a placement up, or shrink it to nothing: farther than this no photo shows it. */
+static int has_gone_astray(const dist_similarity *now, const dist_similarity *start)
+{
+    double times = (double)now->scale / (double)start->scale;
+    double square = 0;
+    for (int k = 0; k < 3; k++) {
+        double away = ((double)now->translation[k] - (double)start->translation[k]) / (double)start->scale;
+        square += away * away;
+    }
+    return !(times > 1e-4 && times < 1e4 && square < 1e8);
 }
 
 /* loss: (iterations, 3), total and terms. The blur goes down in four stages: far from the truth only what is broad in
@@ -480,7 +497,9 @@ static void fit_run(fit *f, double *loss)
     mover.moments = moments;
     int(*pairs)[2] = (int(*)[2])take(f->view_count, sizeof *pairs);
     progress p = progress_begin("fitting");
+    dist_similarity start = f->now.place;
     int stage = -1;
+    int astray = 0;
     for (int i = 0; i < o->iterations; i++) {
         int now = 8 * i / o->iterations < 4 ? 8 * i / o->iterations : 4;
         if (now != stage) { blur_photos(f, o->blur * (float)(4 - now) / 4.0f); }
@@ -488,14 +507,20 @@ static void fit_run(fit *f, double *loss)
         int count = choose_pairs(f, i, pairs);
         loss[3 * i] = fit_loss(f, count, pairs, loss + 3 * i + 1);
         dist_adam_step(&adam, f->code_size, f->now.code, f->d_code);
-        if (f->scene) {
+        if (f->scene && !astray) {
             float step[7] = {0};
+            dist_similarity last = f->now.place;
             dist_adam_step(&mover, 7, step, f->d_code + f->code_size);
             dist_similarity_move(&f->now.place, step);
+            if (has_gone_astray(&f->now.place, &start)) {
+                f->now.place = last;
+                astray = i + 1;
+            }
         }
         progress_show(&p, i + 1, o->iterations, "loss", loss[3 * i]);
     }
     progress_end(&p);
+    if (astray) { printf("the placement has gone astray at step %d and stays where it was before\n", astray); }
     free(pairs);
     free(adam.moments);
 }
@@ -841,7 +866,10 @@ static void print_result(const fit *f, const char *name, const score scores[2], 
 {
     printf("%s: loss %.4f -> %.4f", name, scores[0].loss, scores[1].loss);
     if (f->target_points) {
-        printf("  Chamfer (x 1000, truth to shape) %.3f -> %.3f", 1000 * scores[0].chamfer, 1000 * scores[1].chamfer);
+        printf("  Chamfer (x 1000, truth to shape)");
+        for (int i = 0; i < 2; i++) {
+            printf(scores[i].chamfer < 0 ? "%s none" : "%s %.3f", i ? " ->" : "", 1000 * scores[i].chamfer);
+        }
     }
     if (f->scene && f->target_points) {
         float error[2][3];
@@ -868,7 +896,7 @@ int main(int argc, char **argv)
     double *loss = (double *)take(3 * (size_t)r.iterations, sizeof(double));
     int trials = r.trials ? r.trials : 1;
     int good = 0;
-    float *chamfers = take_floats(2 * (size_t)trials); /* of the starts, of the ends; below 0: none */
+    float *chamfers = take_floats(2 * (size_t)trials); /* of the starts, of the ends; NaN: none */
     score scores[2];
     double seconds = 0;
     for (int t = 0; t < trials; t++) {
@@ -882,6 +910,8 @@ int main(int argc, char **argv)
         f.now.code = choose_code(net, name);
         f.now.place = start.place;
         scores[0] = fit_score(&f);
+        size_t compared = f.compared;
+        if (compared == 0) { fail("no photo shows anything of the start that its neighbor shows: nothing to fit"); }
         unsigned long long scored = f.queries;
         double begin = seconds_now();
         fit_run(&f, loss);
@@ -889,14 +919,16 @@ int main(int argc, char **argv)
         unsigned long long queries = f.queries - scored;
         scores[1] = fit_score(&f);
         f.queries = queries;
-        chamfers[t] = (float)scores[0].chamfer;
-        chamfers[trials + t] = (float)scores[1].chamfer;
+        for (int i = 0; i < 2; i++) { chamfers[i * trials + t] = scores[i].chamfer < 0 ? NAN : (float)scores[i].chamfer; }
         good += scores[0].chamfer > 0 && scores[1].chamfer >= 0 && 3 * scores[1].chamfer <= scores[0].chamfer;
         print_result(&f, name, scores, &start, seconds);
+        tell_if_not_fallen(scores[0].loss, scores[1].loss, (double)r.rate);
+        if (4 * f.compared < compared) {
+            printf("of the %.0f pixels that were compared at the start %.0f are left: the shape has left the photos\n",
+                   (double)compared, (double)f.compared);
+        }
     }
     if (r.trials) { printf("%d of %d end at a third of the start's Chamfer or less\n", good, trials); }
-    write_sheet(&f, &start, &target);
-    write_loss(&r, loss);
     write_report(&f, chamfers, trials, good, scores, seconds);
 
     char path[PATH_SIZE];
@@ -905,6 +937,8 @@ int main(int argc, char **argv)
     check(ctx);
     printf("%s\n", path);
     dist_mesh_destroy(mesh);
+    write_loss(&r, loss);
+    write_sheet(&f, &start, &target);
     free(start.code);
     free(target.code);
     free(chamfers);

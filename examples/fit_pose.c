@@ -660,11 +660,12 @@ static void run_one(dist_context *ctx, const dist_net *net, request *r)
     double seconds = seconds_now() - begin;
     record end = records[count - 1];
     is_explained(&f, &scores[1]);
+    f.camera = end.camera;
+    write_report(&f, &start, &end, scores, count - 1, seconds);
+    write_mesh(&f);
+    write_loss(&f, records, count);
     write_strip(&f, records, count);
     f.camera = end.camera;
-    write_loss(&f, records, count);
-    write_mesh(&f);
-    write_report(&f, &start, &end, scores, count - 1, seconds);
     printf("%d steps, %llu queries, %.2f seconds\n", count - 1, f.total.queries, seconds);
     print_row("loss", start.loss, end.loss);
     print_row("depth error", scores[0].depth_error, scores[1].depth_error);
@@ -674,6 +675,7 @@ static void run_one(dist_context *ctx, const dist_net *net, request *r)
         print_row("translation", start.distance, end.distance);
     }
     tell_if_not_fallen(start.loss, end.loss, (double)r->fit.rate);
+    if (scores[1].iou == 0) { printf("nothing of the shape lies where it was seen: try another --off, --eye or --at\n"); }
     free(records);
     free(code);
     fit_destroy(&f);

@@ -352,6 +352,11 @@ TEST(moves_there_and_back_return)
         dist_camera_move(&c, wrong, wrong + 3);
         CHECK(memcmp(&before, &c, sizeof c) == 0);
     }
+    for (int k = 0; k < 3; k++) { /* nor does it leave float's range */
+        const float far[3] = {2e38f, -2e38f, 1.0f};
+        dist_camera_move(&c, NULL, far);
+        for (int i = 0; i < 3; i++) CHECK(test_finite((double)c.translation[i]));
+    }
 }
 
 /* Rows 28 to 30: what is refused, and that what is close enough is not. */

@@ -1253,6 +1253,12 @@ TEST(moving_a_placement_keeps_it_a_similarity)
     step[0] = -110.0f;
     dist_similarity_move(&s, step);
     CHECK_NEAR(1, (double)s.scale / (1e30 * exp(-110.0)), 1e-6);
+    for (int k = 0; k < 3; k++) { /* nor beyond float's range */
+        float far[7] = {1e30f, 0, 0, 0, 2e38f, -2e38f, 0};
+        dist_similarity_move(&s, far);
+        CHECK(test_finite((double)s.scale) && test_finite((double)s.translation[0]));
+        CHECK(test_finite((double)s.translation[1]) && s.translation[1] < 0);
+    }
     s.scale = -2.0f; /* no placement: it does not become one */
     dist_similarity_move(&s, step);
     CHECK_NEAR(-2, (double)s.scale, 0);

@@ -14788,8 +14788,8 @@ static int disti_warm_beside(disti_warm *warm, int i, int fresh)
     int hit = warm->moved[i] < 2e38f && s < ray->best, miss = ray->status == DIST_RAY_MISS && ray->kept;
     int turn = (disti_warm_x(warm, i) + disti_warm_y(warm, i) + (int)(warm->tape->turn & 1u)) & 1;
     if (!(hit || miss) || !(turn || (hit && warm->calm == 1))) return 0;
-    if (!warm->open[i] || ray->mode != DISTI_DONE || s <= ray->start || s >= ray->leave) return 0;
-    ray->q = s;
+    if (!warm->open[i] || ray->mode != DISTI_DONE || (hit && s <= ray->start) || s >= ray->leave) return 0;
+    ray->q = DISTI_MAX(s, ray->start);
     ray->front.f = 3e38f;
     ray->moved = 1;
     ray->steps = 0;
@@ -15152,7 +15152,8 @@ static void disti_nearest_task(void *arg, int index, int worker)
     }
 }
 
-/* Whether the tape's picture can be started from: the same view of the same field, traced the same way. */
+/* Whether the tape's picture can be started from: the same view of the same field, traced the same way, and with cones,
+   which tell where nothing was. */
 static int disti_render_warms(const disti_tracer *tracer, const dist_camera *camera, const dist_tape *tape)
 {
     const dist_field *a = tracer->field, *b = &tape->field;
@@ -15160,8 +15161,8 @@ static int disti_render_warms(const disti_tracer *tracer, const dist_camera *cam
     return tape->rendered && memcmp(camera, &tape->camera, sizeof *camera) == 0 && a->eval_fn == b->eval_fn &&
            a->user == b->user && memcmp(a->center, b->center, sizeof a->center) == 0 && a->radius >= b->radius &&
            a->radius <= b->radius && tracer->epsilon >= tape->tracer.epsilon &&
-           tracer->epsilon <= tape->tracer.epsilon && how->inside == tracer->how.inside && !tracer->how.no_cones &&
-           !tracer->how.certified;
+           tracer->epsilon <= tape->tracer.epsilon && how->inside == tracer->how.inside && tape->tiled > 0 &&
+           !how->no_cones && !tracer->how.no_cones && !tracer->how.certified;
 }
 
 static void disti_tile_init(const disti_render_job *job, int index, disti_tile *tile)

@@ -174,6 +174,71 @@ TEST(what_jumps_to_where_all_was_clear_is_seen_at_once)
     }
 }
 
+/* The first picture has no cones, as it asked for none or for a few pixels only, so it does not tell where nothing was:
+   the next one is no warm start. A ball comes to stand before another or beside it; 708 pixels still saw that. */
+TEST(pictures_without_cones_are_no_beginning)
+{
+    static unsigned char few[PIXELS];
+    const float eye[3] = {0, 0, 3}, hidden[4] = {0, 0.1f, 0, 0.1f},
+                there[2][4] = {{0, 0.1f, 0.7f, 0.15f}, {0.75f, 0.1f, 0, 0.15f}};
+    for (int i = 0; i < PIXELS; i++) few[i] = i % 2 == 0 && i / SIDE % 2 == 0;
+    for (int k = 0; k < 8; k++) {
+        scene s;
+        float radius = 0.4f;
+        int sparse = k & 1, silhouette = k / 2 & 1;
+        scene_open(&s);
+        s.field.user = &radius;
+        s.field.eval_fn = pair_eval;
+        s.camera = dist_camera_look_at(SIDE, SIDE, 0.75f, eye, NULL, NULL);
+        memcpy(second, hidden, sizeof second);
+        s.how.no_cones = !sparse;
+        s.how.pixels = sparse ? few : NULL;
+        render(&s, 1, silhouette, &warm);
+        s.how.no_cones = 0;
+        s.how.pixels = NULL;
+        memcpy(second, there[k / 4], sizeof second);
+        render(&s, 0, silhouette, &cold);
+        render(&s, 1, silhouette, &warm);
+        int other = 0;
+        for (int i = 0; i < PIXELS; i++)
+            other += cold.mask[i] != warm.mask[i] || fabsf(cold.distance[i] - warm.distance[i]) > 1e-5f;
+        CHECK_EQUAL(0, other);
+        scene_close(&s);
+    }
+}
+
+/* A tube that grows by a 20th of a pixel a render, without a silhouette: a ray that missed it may know another of its
+   least |f|, or none, and is then told by the hit next to it. Some were late by 38 renders. */
+TEST(no_outline_that_grows_is_late_by_more_than_eight_renders)
+{
+    enum { EDGE = 192 };
+    static unsigned char late[EDGE * EDGE];
+    const float eye[3] = {1.2f, 1.4f, 2.2f};
+    scene s;
+    int hits = 0, latest = 0;
+    scene_open(&s);
+    s.numbers[3] = 0.5f;
+    s.numbers[4] = 0.12f;
+    s.camera = dist_camera_look_at(EDGE, EDGE, 0.75f, eye, NULL, NULL);
+    dist_tape_destroy(s.tape);
+    s.tape = dist_tape_create(s.ctx, &s.camera, &s.how);
+    for (int k = 0; k < 200; k++) {
+        s.numbers[0] += 5e-4f;
+        s.numbers[4] += 5e-4f;
+        render(&s, 1, 0, &warm);
+        render(&s, 0, 0, &cold);
+        for (int i = 0; i < EDGE * EDGE; i++) {
+            hits += cold.mask[i];
+            late[i] = (unsigned char)(cold.mask[i] && !warm.mask[i] ? late[i] + 1 : 0);
+            latest = late[i] > latest ? late[i] : latest;
+        }
+    }
+    CHECK(hits > 1000 * 200);
+    CHECK(latest <= 8);
+    if (test_state.verbose) printf("    at most %d renders late\n", latest);
+    scene_close(&s);
+}
+
 /* The camera stands .002 before a solid behind its back and beside another one. */
 TEST(what_lies_behind_the_camera_is_not_seen)
 {
@@ -577,6 +642,8 @@ int main(int argc, char **argv)
     RUN(larger_steps_out_of_pixels_and_into_them_are_seen_at_once);
     RUN(what_comes_out_of_nothing_is_seen_at_once);
     RUN(what_jumps_to_where_all_was_clear_is_seen_at_once);
+    RUN(pictures_without_cones_are_no_beginning);
+    RUN(no_outline_that_grows_is_late_by_more_than_eight_renders);
     RUN(what_lies_behind_the_camera_is_not_seen);
     RUN(what_nothing_foretells_is_seen_when_its_turn_comes);
     RUN(outlines_that_pass_each_other_are_followed);

@@ -201,7 +201,8 @@ TEST(pictures_without_cones_are_no_beginning)
         render(&s, 1, silhouette, &warm);
         int other = 0;
         for (int i = 0; i < PIXELS; i++)
-            other += cold.mask[i] != warm.mask[i] || fabsf(cold.distance[i] - warm.distance[i]) > 1e-5f;
+            other += cold.mask[i] != warm.mask[i] ||
+                     fabsf(cold.distance[i] - warm.distance[i]) > cold.error[i] + warm.error[i] + 1e-5f;
         CHECK_EQUAL(0, other);
         scene_close(&s);
     }

@@ -532,7 +532,8 @@ enum {
     DIST_RAY_MISS = 0,   /* nothing there */
     DIST_RAY_HIT,        /* the distance is within its error bound, see dist_images.error */
     DIST_RAY_UNRESOLVED, /* budget spent: mask 0, distance of the sample of smallest |f|, or where neighbors or cones
-                            say; a surface, if there is one, is no farther from there than the error */
+                            say; a surface, if there is one, is no farther from there than the error. Or it missed the
+                            surface, of an f steeper than its figure, and the silhouette found the solid */
     DIST_RAY_INSIDE,     /* started inside the solid, but for those of DIST_INSIDE_EXIT that leave it */
     DIST_RAY_PLATEAU,    /* f is small and flat: no crossing within reach; mask 0 */
     DIST_RAY_NOT_FINITE, /* the field gave NaN or infinity: mask 0 */
@@ -13076,13 +13077,39 @@ static size_t disti_minima_eval(const disti_minima *m, size_t count)
     return count;
 }
 
+/* Keeps a sample of ray `index`, which misses. Well within a solid it misses none, but stepped over that, as f is steeper
+   than its Lipschitz figure: by how much, its front tells, or its cones' least sample. */
+static void disti_minima_keep(const disti_minima *m, int index, float s, float f)
+{
+    const disti_tracer *tracer = m->tracer;
+    disti_ray *ray = &m->bench->rays[index];
+    if (ray->status != DIST_RAY_MISS) return;
+    if (!(f < -DISTI_MAX(disti_ray_epsilon(tracer, ray, s), tracer->field->coarse_error)) || !disti_finite(f)) {
+        disti_keep_least(ray, s, f);
+        return;
+    }
+    int w = m->tile->width, block = index / w / DISTI_LEAST_BLOCK * DISTI_LEAST_ROW + index % w / DISTI_LEAST_BLOCK;
+    disti_sample from = ray->front;
+    float aside = 0.0f, *steepest = &m->bench->stats->steepest;
+    if (!(from.f > 0.0f)) { /* a cone's axis, beside the ray by no more than half its diagonal */
+        float t = m->bench->least_of->t[block];
+        from.f = m->bench->least_of->f[block];
+        from.s = (float)((double)t - ray->base);
+        aside = 1.5f * (float)DISTI_CONE_FIRST * ray->footprint * t;
+    }
+    float step = fabsf(s - from.s) + aside, rise = disti_empty(tracer, from.f) + disti_empty(tracer, -f);
+    rise = rise * tracer->lipschitz - 2.0f * tracer->noise;
+    if (from.f < 2e38f && step > 0.0f && rise > tracer->lipschitz * step && rise > *steepest * step)
+        *steepest = rise / step;
+    disti_ray_end(ray, DIST_RAY_UNRESOLVED, s, f, DISTI_MAX(s - ray->enter, 0.0f));
+}
+
 /* And keeps what they say. */
 static void disti_minima_ask(const disti_minima *m, size_t count)
 {
     count = disti_minima_eval(m, count);
     for (size_t k = 0; k < count; k++) {
-        disti_ray *ray = &m->bench->rays[m->bench->index[k]];
-        disti_keep_least(ray, ray->q, m->bench->sdf[k]);
+        disti_minima_keep(m, m->bench->index[k], m->bench->rays[m->bench->index[k]].q, m->bench->sdf[k]);
     }
 }
 
@@ -13114,8 +13141,9 @@ static void disti_minima_parabolas(disti_minima *m)
             int index = bench->index[k];
             disti_ray *ray = &bench->rays[index];
             float width = ray->width, left = bench->sdf[k], right = bench->sdf[k + 1];
-            disti_keep_least(ray, disti_ray_within(ray, ray->a.s - width), left);
-            disti_keep_least(ray, disti_ray_within(ray, ray->a.s + width), right);
+            disti_minima_keep(m, index, disti_ray_within(ray, ray->a.s - width), left);
+            disti_minima_keep(m, index, disti_ray_within(ray, ray->a.s + width), right);
+            if (ray->status != DIST_RAY_MISS) continue;
             float fall = left < right ? right - left : left - right;
             if (ray->best != ray->a.s && !(left - 2.0f * ray->a.f + right > 0.5f * fall)) {
                 ray->width = 2.0f * width / DISTI_MAX(ray->fbest, 1e-30f);

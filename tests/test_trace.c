@@ -1726,6 +1726,48 @@ TEST(a_slope_beyond_the_lipschitz_figure_is_reported)
     dist_context_destroy(ctx);
 }
 
+/* A sphere three to five times as steep as is said: rays step over it. Where the samples of the silhouette find the
+   solid, the ray is not told to be a miss, and the figure that it takes is told, though no ray met it. */
+TEST(a_solid_that_only_the_silhouette_finds_is_no_miss)
+{
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(SIDE, SIDE);
+    for (int k = 3; k <= 5; k++) {
+        test_shape shape = shape_make(SHAPE_SPHERE, 0.6, 0, 0, 0);
+        int found = 0, missed = 0;
+        shape.slope = k;
+        dist_field field = shape_field(&shape, 1, 1);
+        dist_images out;
+        memset(&out, 0, sizeof out);
+        out.distance = picture_a.distance;
+        out.silhouette = picture_b.distance; /* not looked at */
+        out.error = picture_a.error;
+        out.status = picture_a.status;
+        out.stats = &picture_a.stats;
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, NULL), ctx);
+        for (int i = 0; i < PIXELS; i++) {
+            float origin[3], direction[3];
+            double along = 0, square = 0;
+            dist_camera_ray(&camera, (float)(i % SIDE), (float)(i / SIDE), origin, direction);
+            for (int j = 0; j < 3; j++) {
+                along -= (double)origin[j] * (double)direction[j];
+                square += (double)origin[j] * (double)origin[j];
+            }
+            double aside = square - along * along, truth = along - sqrt(fmax(0.36 - aside, 0.0));
+            missed += picture_a.status[i] == DIST_RAY_MISS && aside < 0.35;
+            if (picture_a.status[i] != DIST_RAY_UNRESOLVED) continue;
+            found++;
+            CHECK(aside < 0.36);
+            CHECK_NEAR(truth, picture_a.distance[i], (double)picture_a.error[i] + 1e-5);
+        }
+        CHECK(found > 100);
+        CHECK(picture_a.stats.unresolved == (unsigned long long)found);
+        CHECK(picture_a.stats.steepest > 1.5f && picture_a.stats.steepest < 1.001f * (float)k);
+        if (test_state.verbose) printf("    slope %d: %d found, %d missed\n", k, found, missed);
+    }
+    dist_context_destroy(ctx);
+}
+
 /* Pixels that a certified picture misses of those hit with a figure twice as large, in all of several views. */
 static int missed_of_net(dist_context *ctx, const dist_field *field, int *hits)
 {
@@ -2361,6 +2403,7 @@ int main(int argc, char **argv)
     RUN(each_row_of_the_ladder_asks_less_than_the_one_before);
     RUN(the_paper_converges_up_to_slope_1_2_and_not_from_1_34_on);
     RUN(a_slope_beyond_the_lipschitz_figure_is_reported);
+    RUN(a_solid_that_only_the_silhouette_finds_is_no_miss);
     RUN(certified_pictures_of_nets_miss_nothing);
     RUN(bounds_reach_to_where_f_was_foretold_to_cross_and_over_what_is_flat);
     RUN(tiles_that_cost_most_last_time_come_first_and_change_nothing);

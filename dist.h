@@ -569,9 +569,9 @@ typedef struct dist_render_desc {
     int no_prediction;   /* 1: no ray starts from what its neighbors found */
     int certified;       /* 1: only steps that the Lipschitz figures prove, field.certified where that is larger, for
                             one to four times the queries of a small picture, four to ten of a large one, more where
-                            f stays small beside outlines; nothing is missed, nor seen by more than epsilon too far
-                            away, where they are bounds: a net's are the steepest slopes sampled, dist_stats.steepest
-                            says when these were too small */
+                            f stays small beside outlines; nothing is missed but, now and then, a curved sheet without
+                            depth, nor seen by more than epsilon too far away, where they are bounds: a net's are the
+                            steepest slopes sampled, dist_stats.steepest says when these were too small */
     /* dist_trace only. any_hit 1: a ray ends as soon as anything is certain to block it, for shadows; its distance is
        then that of a sample inside what blocks, its error how far before that it goes in. max_distance: how far a ray
        looks, in lengths of its direction (1: from origin to origin + direction); 0: without end */
@@ -699,6 +699,8 @@ typedef struct dist_images {
     float *error;          /* bound on the error of distance, as good as f's slopes are sampled; 0 where that is the
                               background. Behind the edge of a nearer surface it reaches to that; with
                               how.certified only where a slope beyond the Lipschitz figure was met in the same tile.
+                              It knows nothing of a part two or three pixels wide that hovers before a surface and
+                              that all of a pixel's neighbors miss: how.no_prediction looks for those.
                               With field.coarse_fn for eval_fn field.coarse_error is counted in, near outlines by
                               what is seen beside; a ray that just meets an edge may go on far behind it. Where a
                               ray crept along a surface before its hit, up to 0.02 of the radius of that way, too.
@@ -7752,6 +7754,7 @@ static void disti_wide_eval(const dist_shape *shape, int worker, size_t n, const
     wide[0] = point + (size_t)net->point_size * stride;
     wide[1] = wide[0] + (size_t)net->max_rows * stride;
     disti_blocks_begin(shape, worker, &b, n);
+    b.values = 1;
     for (size_t at = 0; at < n; at += stride) {
         size_t count = DISTI_MIN(n - at, stride), blocks = (count + DISTI_BLOCK - 1) / DISTI_BLOCK;
         for (size_t j = 0; j < blocks; j++) {
@@ -9105,6 +9108,13 @@ static const disti_tensor *disti_loader_weight(const disti_loader *loader, int k
     return *gain ? disti_loader_find(loader, "lin", k, ".parametrizations.weight.original1") : NULL;
 }
 
+/* Also with module. before it. */
+static const disti_tensor *disti_loader_find_codes(const disti_loader *loader)
+{
+    const disti_tensor *codes = disti_archive_find(&loader->archive, "codes");
+    return codes || !*loader->prefix ? codes : disti_archive_find(&loader->archive, "module.codes");
+}
+
 /* LayerNorm's weight or bias behind layer k, also by the name that DeepSDF's decoder gives it. */
 static const disti_tensor *disti_loader_norm(const disti_loader *loader, int k, const char *ending)
 {
@@ -9123,6 +9133,34 @@ static dist_status disti_loader_norms(disti_loader *loader)
                                      "fold it into the layer before it", mean->name, 0, 0);
         if (!told && disti_loader_norm(loader, k, ".weight")) loader->net->normed = 1;
     }
+    return loader->status;
+}
+
+/* What a layer has that is not understood, or twice, must not be left out without a word. */
+static dist_status disti_loader_strangers(disti_loader *loader)
+{
+    static const char *const known[6] = {".weight", ".bias", ".weight_g", ".weight_v",
+                                         ".parametrizations.weight.original0",
+                                         ".parametrizations.weight.original1"};
+    size_t prefix = strlen(loader->prefix);
+    for (size_t i = 0; i < loader->archive.tensor_count; i++) {
+        const char *name = loader->archive.tensors[i].name, *ending;
+        int found = 0;
+        if (strncmp(name, loader->prefix, prefix) != 0 || strncmp(name + prefix, "lin", 3) != 0) continue;
+        ending = name + prefix + 3;
+        if (*ending < '0' || *ending > '9') continue;
+        while (*ending >= '0' && *ending <= '9') ending++;
+        for (int k = 0; k < 6; k++) found |= strcmp(ending, known[k]) == 0;
+        if (!found)
+            return disti_loader_fail(loader, DIST_UNSUPPORTED, "dist_net_load: tensor %s is of a layer, which has "
+                                     ".weight, or a weight-norm pair, and .bias", name, 0, 0);
+    }
+    for (int k = 0; k < loader->net->layers; k++)
+        if ((disti_loader_find(loader, "lin", k, known[0]) != NULL) +
+                (disti_loader_find(loader, "lin", k, known[2]) != NULL) +
+                (disti_loader_find(loader, "lin", k, known[4]) != NULL) > 1)
+            return disti_loader_fail(loader, DIST_BAD_FILE, "dist_net_load: layer %d has its weights twice", NULL, k,
+                                     0);
     return loader->status;
 }
 
@@ -9158,7 +9196,7 @@ static dist_status disti_loader_shapes(disti_loader *loader)
     if (net->layers == DISTI_MAX_LAYERS && disti_loader_weight(loader, DISTI_MAX_LAYERS, &gain))
         return disti_loader_fail(loader, DIST_UNSUPPORTED, "dist_net_load: more than %d layers", NULL, DISTI_MAX_LAYERS,
                           0);
-    if (disti_loader_norms(loader) != DIST_OK) return loader->status;
+    if (disti_loader_norms(loader) != DIST_OK || disti_loader_strangers(loader) != DIST_OK) return loader->status;
     double size = disti_loader_number(loader, "dist.code_size", 0, DISTI_MAX_WIDTH,
                                       net->layer[0].in - net->point_size);
     if (loader->status != DIST_OK) return loader->status;
@@ -9241,13 +9279,13 @@ static dist_status disti_loader_values(disti_loader *loader)
                           net->params + layer->norm_bias);
     }
     if (net->code_count == 0) return loader->status;
-    return disti_loader_read(loader, disti_archive_find(&loader->archive, "codes"), "codes", 0,
+    return disti_loader_read(loader, disti_loader_find_codes(loader), "codes", 0,
                              (size_t)net->code_count * (size_t)net->code_size, net->codes);
 }
 
 static dist_status disti_loader_codes(disti_loader *loader)
 {
-    const disti_tensor *codes = disti_archive_find(&loader->archive, "codes");
+    const disti_tensor *codes = disti_loader_find_codes(loader);
     if (!codes || loader->net->code_size == 0) return DIST_OK;
     if (codes->rank != 2 || codes->shape[1] != (size_t)loader->net->code_size || codes->shape[0] > 0x7fffffffu)
         return disti_loader_fail(loader, DIST_BAD_FILE, "dist_net_load: tensor codes must be (n, %d)", NULL,
@@ -13077,8 +13115,8 @@ static size_t disti_minima_eval(const disti_minima *m, size_t count)
     return count;
 }
 
-/* Keeps a sample of ray `index`, which misses. Well within a solid it misses none, but stepped over that, as f is steeper
-   than its Lipschitz figure: by how much, its front tells, or its cones' least sample. */
+/* Keeps a sample of ray `index`, which misses. Well within a solid it is no miss: the ray stepped over that, as f is
+   steeper than its Lipschitz figure; by how much, its front tells, or its cones' least sample. */
 static void disti_minima_keep(const disti_minima *m, int index, float s, float f)
 {
     const disti_tracer *tracer = m->tracer;

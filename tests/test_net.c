@@ -1147,6 +1147,28 @@ static void rename_all(unsigned char *bytes, size_t size, const char *from, cons
         if (memcmp(bytes + i, from, n) == 0) memcpy(bytes + i, to, n);
 }
 
+/* What stands in the file of a layer, or of codes, is read or refused. */
+TEST(nothing_of_a_layer_is_left_out_without_a_word)
+{
+    const char *layers = "module.lin0.weight 4 5;module.lin0.bias 4;module.lin1.weight 1 4;module.lin1.bias 1;";
+    char tensors[256];
+    size_t size;
+    REFUSED(DIST_UNSUPPORTED, "tensor lin1.scale is of a layer", "",
+            "lin0.weight 4 5;lin0.bias 4;lin1.weight 1 4;lin1.bias 1;lin1.scale 4;");
+    REFUSED(DIST_BAD_FILE, "layer 0 has its weights twice", "",
+            "lin0.weight 4 5;lin0.bias 4;lin0.weight_g 4 1;lin0.weight_v 4 5;lin1.weight 1 4;lin1.bias 1;");
+    for (int with = 0; with < 2; with++) {
+        dist_context *ctx = test_context();
+        snprintf(tensors, sizeof tensors, "%s%s 3 2;", layers, with ? "module.codes" : "codes");
+        unsigned char *bytes = file_of("", tensors, "F32", -1, 0.0f, &size);
+        dist_net *net = dist_net_load(ctx, bytes, size);
+        CHECK_EQUAL(3, dist_net_code_count(net));
+        free(bytes);
+        dist_net_destroy(net);
+        dist_context_destroy(ctx);
+    }
+}
+
 /* DeepSDF's decoder calls it bnK, and its files say nothing about it. */
 TEST(layer_norm_that_only_its_tensors_tell_of_is_not_left_out)
 {
@@ -1688,6 +1710,7 @@ int main(int argc, char **argv)
     RUN(channels_that_end_the_header_are_read_no_further);
     RUN(spaces_around_the_channels_names_are_none_of_theirs);
     RUN(the_least_numbers_a_file_may_say_are_floats);
+    RUN(nothing_of_a_layer_is_left_out_without_a_word);
     RUN(layer_norm_that_only_its_tensors_tell_of_is_not_left_out);
     RUN(tensors_that_do_not_fit_are_refused_with_a_sentence);
     RUN(a_layer_missing_in_the_middle_is_refused);

@@ -1925,6 +1925,7 @@ TEST(no_ball_is_passed_for_one_behind_it_that_a_step_found)
     }
     CHECK(seen > 3000 * scenes);
     CHECK_EQUAL(0, lost);
+    if (test_state.verbose || lost) printf("    %d of %d hits lost\n", lost, seen);
     dist_context_destroy(ctx);
 }
 

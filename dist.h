@@ -13115,14 +13115,16 @@ static size_t disti_minima_eval(const disti_minima *m, size_t count)
     return count;
 }
 
-/* Keeps a sample of ray `index`, which misses. Well within a solid it is no miss: the ray stepped over that, as f is
-   steeper than its Lipschitz figure; by how much, its front tells, or its cones' least sample. */
+/* Keeps a sample of ray `index`, which misses. Well within a solid that it did not start in it is no miss: the ray
+   stepped over that, as f is steeper than its Lipschitz figure; by how much, its front tells, or its cones' least
+   sample. */
 static void disti_minima_keep(const disti_minima *m, int index, float s, float f)
 {
     const disti_tracer *tracer = m->tracer;
     disti_ray *ray = &m->bench->rays[index];
     if (ray->status != DIST_RAY_MISS) return;
-    if (!(f < -DISTI_MAX(disti_ray_epsilon(tracer, ray, s), tracer->field->coarse_error)) || !disti_finite(f)) {
+    float most = -DISTI_MAX(disti_ray_epsilon(tracer, ray, s), tracer->field->coarse_error);
+    if (!(f < most) || !disti_finite(f) || ray->sign < 0.0f) {
         disti_keep_least(ray, s, f);
         return;
     }

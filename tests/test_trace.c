@@ -1765,6 +1765,18 @@ TEST(a_solid_that_only_the_silhouette_finds_is_no_miss)
         CHECK(picture_a.stats.steepest > 1.5f && picture_a.stats.steepest < 1.001f * (float)k);
         if (test_state.verbose) printf("    slope %d: %d found, %d missed\n", k, found, missed);
     }
+    test_shape all = shape_make(SHAPE_SPHERE, 1.4, 0, 0, 0); /* but a ray within a solid that has no end does miss it */
+    dist_field field = shape_field(&all, 1, 1);
+    const float eye[3] = {0.3f, 0.2f, 0.5f};
+    dist_render_desc how = plain_how();
+    how.inside = DIST_INSIDE_EXIT;
+    camera = dist_camera_look_at(SIDE, SIDE, 0.7f, eye, NULL, NULL);
+    dist_images out;
+    memset(&out, 0, sizeof out);
+    out.silhouette = picture_b.distance;
+    out.stats = &picture_a.stats;
+    CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+    CHECK(picture_a.stats.unresolved == 0 && picture_a.stats.steepest <= 0);
     dist_context_destroy(ctx);
 }
 

@@ -9139,9 +9139,8 @@ static dist_status disti_loader_norms(disti_loader *loader)
 /* What a layer has that is not understood, or twice, must not be left out without a word. */
 static dist_status disti_loader_strangers(disti_loader *loader)
 {
-    static const char *const known[6] = {".weight", ".bias", ".weight_g", ".weight_v",
-                                         ".parametrizations.weight.original0",
-                                         ".parametrizations.weight.original1"};
+    static const char known[6][36] = {".weight", ".bias", ".weight_g", ".weight_v",
+                                      ".parametrizations.weight.original0", ".parametrizations.weight.original1"};
     size_t prefix = strlen(loader->prefix);
     for (size_t i = 0; i < loader->archive.tensor_count; i++) {
         const char *name = loader->archive.tensors[i].name, *ending;

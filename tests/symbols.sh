@@ -35,8 +35,10 @@ for cc in $(compilers); do
 done
 # With position independence, which is the default: but for the tables of kernels no pointers stand in tables.
 for cc in $(compilers); do
-    "$cc" -std=c99 -O2 -fPIC -DSMALL_LIBRARY -c tests/small.c -o "$work/pic.o" 2>"$work/answer" && nm "$work/pic.o" |
-        grep -E ' [bBdDCsSgG] ' | grep -v -E '[ .](scalar|sse2|avx2|avx512|neon)(\.[0-9]+)?$' >"$work/pic"
+    if "$cc" -std=c99 -O2 -fPIC -DSMALL_LIBRARY -c tests/small.c -o "$work/pic.o" 2>"$work/pic"; then
+        nm "$work/pic.o" | grep -E ' [bBdDCsSgG] ' |
+            grep -v -E '[ .](scalar|sse2|avx2|avx512|neon)(\.[0-9]+)?$' >"$work/pic"
+    fi
     expect_nothing "no_pointers_in_tables_${cc}" "$work/pic"
 done
 object openmp $CC -std=c99 -O0 -fopenmp

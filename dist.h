@@ -1179,6 +1179,7 @@ struct dist_context {
     char message[400];
     const char *function;   /* the public one that was called last, for the sentence */
     const char *path;       /* of the file that is being read or written, for that too */
+    int instance;           /* 1 + which one of a new scene's is being looked at, for that too; 0: none */
     unsigned char *scratch; /* workers * DISTI_SCRATCH_BYTES: counters, then the tracer's part */
     unsigned char *lanes;   /* workers * lane_bytes: the field's part; grown by create functions only */
     size_t lane_bytes;      /* of each worker, a multiple of DISTI_ALIGNMENT */
@@ -1287,7 +1288,7 @@ static size_t disti_fail_text(char *out, size_t n, size_t size, const char *text
 }
 
 /* Keeps the sentence of the first failure and returns status. In format %s stands for text, the first and second %d
-   for a and b; what is too long is cut. The file's path, if there is one, comes last. */
+   for a and b; what is too long is cut. The instance and the file's path, if there are any, come last. */
 static dist_status disti_fail(dist_context *ctx, dist_status status, const char *format, const char *text, double a,
                               double b)
 {
@@ -1305,6 +1306,13 @@ static dist_status disti_fail(dist_context *ctx, dist_status status, const char 
         } else {
             message[n++] = *c;
         }
+    }
+    if (ctx->instance > 0) {
+        memcpy(message + n, " (instances[", 12);
+        n += 12;
+        n += disti_format_number(message + n, ctx->instance - 1, 6);
+        message[n++] = ']';
+        message[n++] = ')';
     }
     if (ctx->path) {
         message[n++] = ' ';
@@ -5574,7 +5582,10 @@ DIST_API dist_scene *dist_scene_create(dist_context *ctx, int count, const dist_
     memset(scene->placed, 0, (size_t)count * sizeof(disti_placed));
     for (int k = 0; k < count; k++) {
         disti_placed *placed = &scene->placed[k];
-        if (disti_scene_place(scene, k, &instances[k], 1, name) != DIST_OK) goto fail;
+        ctx->instance = k + 1;
+        dist_status status = disti_scene_place(scene, k, &instances[k], 1, name);
+        ctx->instance = 0;
+        if (status != DIST_OK) goto fail;
         placed->code = disti_field_code(&placed->field);
         placed->offset = scene->code_size;
         scene->code_size += placed->code + 7;

@@ -1387,6 +1387,18 @@ TEST(scenes_refuse_what_cannot_be_placed)
     x = good;
     x.placement.translation[1] = -1e30f;
     refused(ctx, &x, "at -1e30 on axis 1; must be within 1e15");
+    dist_instance many[3] = {good, good, good}; /* which one is refused */
+    many[2].placement.scale = -1;
+    CHECK(dist_scene_create(ctx, 3, many) == NULL);
+    CHECK_TEXT("placement.scale is -1, must be above 0 (0: 1) (instances[2])", dist_context_message(ctx));
+    dist_context_clear(ctx);
+    many[0].field = NULL;
+    CHECK(dist_scene_create(ctx, 3, many) == NULL);
+    CHECK_TEXT("(instances[0])", dist_context_message(ctx));
+    dist_context_clear(ctx);
+    CHECK(dist_scene_create(ctx, 0, many) == NULL);
+    CHECK(!strstr(dist_context_message(ctx), "instances["));
+    dist_context_clear(ctx);
     dist_scene *scene = dist_scene_create(ctx, 1, &good);
     REQUIRE(scene != NULL);
     x = good;

@@ -11194,6 +11194,12 @@ DISTI_INLINE void disti_stats_slope(const disti_tracer *tracer, const disti_ray 
         stats->steepest = rise / step;
 }
 
+/* The ray's distance from where it sets out: exactly 0 there, and never behind it. */
+static double disti_ray_along(const disti_ray *ray)
+{
+    return ray->best > (float)-ray->base ? ray->base + (double)ray->best : 0.0;
+}
+
 static float disti_hit_depth(const disti_ray *ray)
 {
     if (ray->status != DIST_RAY_HIT || ray->mode != DISTI_DONE) return 0.0f;
@@ -11406,7 +11412,7 @@ static void disti_free_task(void *arg, int index, int worker)
         const disti_ray *ray = &bench.rays[i];
         dist_hit *hit = job->hits + first + i;
         disti_stats_ray(job->tracer, ray, bench.stats);
-        hit->distance = disti_within_float(ray->base + (double)ray->best);
+        hit->distance = disti_within_float(disti_ray_along(ray));
         hit->error = disti_ray_bound(job->tracer, ray);
         hit->sdf = ray->fbest;
         hit->status = ray->status;
@@ -14156,7 +14162,7 @@ static void disti_render_pixel(const disti_render_job *job, const disti_ray *ray
     const dist_images *out = job->out;
     int hit = disti_ray_is_hit(tracer, ray), skipped = ray->status == DIST_RAY_SKIPPED;
     int placed = hit || ray->status == DIST_RAY_UNRESOLVED;
-    double distance = ray->base + (double)ray->best;
+    double distance = disti_ray_along(ray);
     if (out->depth) out->depth[pixel] = placed ? (float)(distance * (double)ray->cosine) : tracer->how.background;
     if (out->distance) out->distance[pixel] = placed ? (float)distance : tracer->how.background;
     if (out->silhouette) out->silhouette[pixel] = skipped ? 0.0f : disti_ray_silhouette(tracer, ray);

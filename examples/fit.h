@@ -265,25 +265,38 @@ typedef struct score {
     double chamfer;     /* as DeepSDF defines it: squared distances, both ways */
 } score;
 
-static inline score score_pictures(const observation *s, const float *depth, const unsigned char *mask)
+/* Two pictures beside each other, or pairs of them in turn: sums over their pixels. */
+typedef struct agreement {
+    double difference, compared, both, either;
+} agreement;
+
+static inline void agreement_add(agreement *o, size_t n, const float *seen, const unsigned char *seen_mask,
+                                 const float *depth, const unsigned char *mask)
 {
-    double sum = 0;
-    double compared = 0;
-    double both = 0;
-    double either = 0;
-    for (size_t i = 0; i < s->n; i++) {
-        both += s->mask[i] && mask[i];
-        either += s->mask[i] || mask[i];
-        if (!s->mask[i] || !mask[i] || !is_depth(s->depth[i])) { continue; }
-        sum += fabs((double)depth[i] - (double)s->depth[i]);
-        compared += 1;
+    for (size_t i = 0; i < n; i++) {
+        o->both += seen_mask[i] && mask[i];
+        o->either += seen_mask[i] || mask[i];
+        if (!seen_mask[i] || !mask[i] || !is_depth(seen[i])) { continue; }
+        o->difference += fabs((double)depth[i] - (double)seen[i]);
+        o->compared += 1;
     }
+}
+
+static inline score agreement_score(const agreement *o)
+{
     score result;
     result.loss = -1;
-    result.depth_error = compared > 0 ? sum / compared : -1;
-    result.iou = either > 0 ? both / either : -1;
+    result.depth_error = o->compared > 0 ? o->difference / o->compared : -1;
+    result.iou = o->either > 0 ? o->both / o->either : -1;
     result.chamfer = -1;
     return result;
+}
+
+static inline score score_pictures(const observation *s, const float *depth, const unsigned char *mask)
+{
+    agreement o = {0, 0, 0, 0};
+    agreement_add(&o, s->n, s->depth, s->mask, depth, mask);
+    return agreement_score(&o);
 }
 
 enum { SURFACE_POINTS = 30000 };

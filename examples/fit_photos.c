@@ -57,6 +57,8 @@ typedef struct view_data {
     float *photo, *color; /* as taken; as compared, perhaps blurred */
     float *depth, *d_depth;
     unsigned char *mask;
+    float *true_depth; /* of the shape that the photo was taken of; NULL: not known */
+    unsigned char *true_mask;
     unsigned *triangle; /* mesh baseline: 1 + the triangle in each pixel, 0 for none */
     dist_tape *tape;
     int neighbor[NEIGHBORS];
@@ -129,7 +131,8 @@ static void take_photo(fit *f, const dist_field *field, view_data *v)
     dist_images out;
     memset(&out, 0, sizeof out);
     out.distance = take_floats(n);
-    out.mask = (unsigned char *)take(n, 1);
+    out.depth = v->true_depth = take_floats(n);
+    out.mask = v->true_mask = (unsigned char *)take(n, 1);
     out.color = field->color_fn ? v->photo : NULL;
     dist_render(f->ctx, field, &v->camera, NULL, &out, NULL);
     check(f->ctx);
@@ -146,7 +149,6 @@ static void take_photo(fit *f, const dist_field *field, view_data *v)
         if (!out.mask[i] && f->asked->plain) { color[0] = color[1] = color[2] = 0.8f; }
     }
     free(out.distance);
-    free(out.mask);
 }
 
 static void view_take(fit *f, view_data *v, const char *name)
@@ -530,17 +532,21 @@ static void fit_run(fit *f, double *loss)
 static score fit_score(fit *f)
 {
     double terms[2];
-    score s;
-    memset(&s, 0, sizeof s);
+    agreement seen = {0, 0, 0, 0};
     int(*pairs)[2] = (int(*)[2])take(f->view_count, sizeof *pairs);
     for (size_t i = 0; i < f->view_count; i++) {
         pairs[i][0] = (int)i;
         pairs[i][1] = f->views[i].neighbor[0];
     }
     blur_photos(f, 0.0f);
-    s.loss = fit_loss(f, (int)f->view_count, pairs, terms);
+    double loss = fit_loss(f, (int)f->view_count, pairs, terms);
     free(pairs);
-    s.chamfer = -1;
+    for (size_t i = 0; i < f->view_count; i++) {
+        const view_data *v = &f->views[i];
+        if (v->true_depth) { agreement_add(&seen, pixel_count(v), v->true_depth, v->true_mask, v->depth, v->mask); }
+    }
+    score s = agreement_score(&seen);
+    s.loss = loss;
     if (f->target_points) {
         float *points = NULL;
         double both = 0;
@@ -660,7 +666,9 @@ static void write_report(const fit *f, const float *chamfers, int trials, int go
     json_text(&j, "photos", o->photos ? o->photos : "taken of the model");
     if (!o->photos) { json_text(&j, "texture", o->texture); }
     for (int i = 0; i < 2; i++) {
-        json_number(&j, i ? "loss_end" : "loss_start", scores[i].loss);
+        json_score(&j, "loss", when[i], scores[i].loss);
+        json_score(&j, "depth_error", when[i], scores[i].depth_error);
+        json_score(&j, "iou", when[i], scores[i].iou);
         json_score(&j, "chamfer", when[i], scores[i].chamfer);
     }
     json_count(&j, "trials", (unsigned long long)trials);
@@ -851,6 +859,8 @@ static void fit_destroy(fit *f)
         free(v->depth);
         free(v->d_depth);
         free(v->mask);
+        free(v->true_depth);
+        free(v->true_mask);
         free(v->triangle);
         dist_tape_destroy(v->tape);
     }

@@ -545,20 +545,43 @@ static void write_loss(const fit *f, const record *records, int count)
     free(columns);
 }
 
+/* Points (n, 3) of the world in the camera's space. */
+static void place_before(const dist_camera *camera, size_t n, const float *points, float *placed)
+{
+    for (size_t i = 0; i < 3 * n; i += 3) {
+        float x[3] = {points[i], points[i + 1], points[i + 2]};
+        for (size_t k = 0; k < 3; k++) {
+            const float *row = camera->rotation + 3 * k;
+            placed[i + k] = row[0] * x[0] + row[1] * x[1] + row[2] * x[2] + camera->translation[k];
+        }
+    }
+}
+
+/* Chamfer distance of the shape before the camera of the start, and that of the end, from the shape before the true
+   one; not known without. */
+static void score_places(const fit *f, const dist_camera *start, const dist_camera *end, score scores[2])
+{
+    float *points = NULL;
+    dist_mesh_destroy(surface_of(f->ctx, &f->field, &points));
+    float *truth = points && f->truth_known ? take_floats(3 * SURFACE_POINTS) : NULL;
+    float *placed = take_floats(3 * SURFACE_POINTS);
+    for (int i = 0; i < 2 && truth; i++) {
+        place_before(&f->truth, SURFACE_POINTS, points, truth);
+        place_before(i ? end : start, SURFACE_POINTS, points, placed);
+        scores[i].chamfer = chamfer_between(f->ctx, truth, placed);
+    }
+    free(placed);
+    free(truth);
+    free(points);
+}
+
 /* The shape in the recovered camera's space, to be laid over points made from the depth image. */
 static void write_mesh(fit *f)
 {
     char path[PATH_SIZE];
     float *points = NULL;
     dist_mesh *mesh = surface_of(f->ctx, &f->field, &points);
-    for (size_t i = 0; i < mesh->vertex_count; i++) {
-        float *p = mesh->vertices + 3 * i;
-        float x[3] = {p[0], p[1], p[2]};
-        for (size_t k = 0; k < 3; k++) {
-            const float *row = f->camera.rotation + 3 * k;
-            p[k] = row[0] * x[0] + row[1] * x[1] + row[2] * x[2] + f->camera.translation[k];
-        }
-    }
+    place_before(&f->camera, mesh->vertex_count, mesh->vertices, mesh->vertices);
     dist_mesh_save(f->ctx, mesh, path_of(path, f->asked->fit.out, ".ply"));
     check(f->ctx);
     printf("%s\n", path);
@@ -579,6 +602,7 @@ static void write_report(const fit *f, const record *start, const record *end, c
         json_score(&j, "loss", when[i], (i ? end : start)->loss);
         json_score(&j, "depth_error", when[i], scores[i].depth_error);
         json_score(&j, "iou", when[i], scores[i].iou);
+        json_score(&j, "chamfer", when[i], scores[i].chamfer);
     }
     if (f->truth_known) {
         json_number(&j, "rotation_error_deg_start", start->degrees);
@@ -661,6 +685,7 @@ static void run_one(dist_context *ctx, const dist_net *net, request *r)
     record end = records[count - 1];
     is_explained(&f, &scores[1]);
     f.camera = end.camera;
+    score_places(&f, &start.camera, &end.camera, scores);
     write_report(&f, &start, &end, scores, count - 1, seconds);
     write_mesh(&f);
     write_loss(&f, records, count);
@@ -671,6 +696,7 @@ static void run_one(dist_context *ctx, const dist_net *net, request *r)
     print_row("depth error", scores[0].depth_error, scores[1].depth_error);
     print_row("mask IoU", scores[0].iou, scores[1].iou);
     if (f.truth_known) {
+        print_row("Chamfer", scores[0].chamfer, scores[1].chamfer);
         print_row("rotation, degrees", start.degrees, end.degrees);
         print_row("translation", start.distance, end.distance);
     }

@@ -52,6 +52,18 @@ fit_says() {
 expect a_fit_that_diverges_says_so fit_says 10 1
 expect a_fit_that_falls_says_no_such_thing fit_says 0.01 0
 expect two_photos_are_enough "$work/fit_photos" --views 2 --size 24x24 --iterations 6 --out "$work/two"
+# Every fit's report has the same names, with numbers wherever the truth is known: PROGRAM and its arguments.
+tells_all() {
+    "$@" --out "$work/told" >"$work/said" || { cat "$work/said"; return 1; }
+    for key in loss_start loss_end depth_error_start depth_error_end iou_start iou_end chamfer_start chamfer_end queries \
+        seconds iterations; do
+        grep -q "^  \"$key\": [0-9]" "$work/told.json" || { echo "no number of $key"; return 1; }
+    done
+}
+expect fit_depth_tells_all tells_all "$work/fit_depth" --demo --size 32 --iterations 2
+expect fit_pose_tells_all tells_all "$work/fit_pose" --size 32 --iterations 2 --restarts 0
+expect fit_photos_tells_all tells_all "$work/fit_photos" --views 3 --size 24x24 --iterations 2
+expect fit_photos_of_a_mesh_tell_all tells_all "$work/fit_photos" --views 3 --size 24x24 --iterations 2 --gradient mesh
 # What cannot be done is refused with a sentence, and nothing else happens: NAME WORDS COMMAND...
 refuses() {
     refused=$1 words=$2

@@ -10574,7 +10574,7 @@ static int disti_ray_band(const disti_tracer *tracer, disti_ray *ray, disti_samp
     }
     if (tracer->how.certified) { /* on until the steps are spent */
         float rise = now.f - fabsf(ray->fbest); /* beyond the rounding of numbers of the radius's size: no plateau */
-        int flat = change < 1e-3f * all && rise <= 1.2e-7f * tracer->field->radius;
+        int flat = change < 1e-3f * all && 1e-3f * all > tracer->noise && rise <= 1.2e-7f * tracer->field->radius;
         int zeros = ray->steps >= 1000 && now.f == 0.0f && change == 0.0f; /* a network of zeros */
         int ends = (ray->steps + 1 >= tracer->how.max_steps && flat) || zeros;
         return ends ? disti_ray_end(ray, DIST_RAY_PLATEAU, now.s, now.f, 0.0f) : disti_ray_feel(tracer, ray, epsilon);
@@ -10582,8 +10582,10 @@ static int disti_ray_band(const disti_tracer *tracer, disti_ray *ray, disti_samp
     float rise = now.f - fabsf(ray->fbest); /* past the least of a solid that was not met f is no plateau */
     if (ray->side >= 16 && !(change >= 1e-3f * all) && !(rise > 1e-3f * (now.s - ray->best)))
         return disti_ray_end(ray, DIST_RAY_PLATEAU, now.s, now.f, 0.0f);
-    if (ray->side >= 16 && now.f <= tracer->noise)
-        return disti_ray_end(ray, DIST_RAY_HIT, now.s, now.f, now.f * all / change);
+    if (ray->side >= 16 && now.f <= tracer->noise) { /* it falls, or has passed by within noise */
+        float error = change > 0.0f ? now.f * all / change : all + tracer->noise / (tracer->lipschitz / 16.0f);
+        return disti_ray_end(ray, DIST_RAY_HIT, now.s, now.f, DISTI_MIN(error, ray->leave - ray->enter));
+    }
     if (ray->side >= 48) return disti_ray_give_up(ray); /* it falls, but to where? */
     return disti_ray_feel(tracer, ray, epsilon);
 }
@@ -10816,6 +10818,18 @@ static int disti_ray_marched(const disti_tracer *tracer, disti_ray *ray, disti_s
     return disti_ray_onward(tracer, ray);
 }
 
+/* The march's budget is spent, and b lies in a solid: it is hit, but there may be another in the room before it, from
+   the end of the front's sphere on. */
+static int disti_ray_end_march(const disti_tracer *tracer, disti_ray *ray, disti_sample b)
+{
+    disti_sample a = ray->front;
+    int alone = disti_ray_alone(tracer, ray, a, b, 1e-3f), goes = disti_ray_open_bracket(tracer, ray, a, b);
+    float first = b.s - a.s - disti_empty(tracer, a.f);
+    if (!alone) ray->target = DISTI_MAX(ray->target, first);
+    if (!alone && !goes) ray->error = DISTI_MAX(ray->error, first);
+    return goes;
+}
+
 static void disti_keep_least(disti_ray *ray, float s, float f)
 {
     if (!disti_finite(f) || fabsf(f) >= fabsf(ray->fbest)) return;
@@ -10834,11 +10848,12 @@ static int disti_ray_advance(const disti_tracer *tracer, disti_ray *ray, float s
         return disti_ray_end(ray, DIST_RAY_HIT, now.s, now.f, now.s - ray->front.s);
     if (ray->mode == DISTI_BRACKET) {
         if (ray->steps < tracer->how.max_steps + 40) return disti_ray_bracketed(tracer, ray, now);
-        return disti_ray_end(ray, DIST_RAY_HIT, 0.5f * (ray->a.s + ray->b.s), 0.0f, ray->b.s - ray->a.s);
+        float width = ray->b.s - ray->a.s;
+        return disti_ray_end(ray, DIST_RAY_HIT, 0.5f * (ray->a.s + ray->b.s), 0.0f, DISTI_MAX(width, ray->target));
     }
-    if (spent && now.f <= 0.0f) return disti_ray_open_bracket(tracer, ray, ray->front, now);
+    if (spent && now.f <= 0.0f) return disti_ray_end_march(tracer, ray, now);
     if (spent && ray->mode != DISTI_BAND && ray->b.f < 0.0f && ray->b.s > ray->front.s)
-        return disti_ray_open_bracket(tracer, ray, ray->front, ray->b);
+        return disti_ray_end_march(tracer, ray, ray->b);
     if (spent) return disti_ray_give_up(ray);
     switch (ray->mode) {
     case DISTI_FIRST: return disti_ray_first(tracer, ray, now);

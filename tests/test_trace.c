@@ -1780,6 +1780,122 @@ TEST(a_solid_that_only_the_silhouette_finds_is_no_miss)
     dist_context_destroy(ctx);
 }
 
+/* Two balls, the smaller one first: (center z, radius) of each. */
+static void two_balls(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    const float(*ball)[2] = (const float(*)[2])user;
+    (void)worker;
+    (void)gradient; /* traces ask for none */
+    for (size_t i = 0; i < n; i++, points += 3) {
+        double f[2];
+        for (int k = 0; k < 2; k++)
+            f[k] = shape_length((double)points[0], (double)points[1], (double)points[2] - (double)ball[k][0]) -
+                   (double)ball[k][1];
+        sdf[i] = (float)fmin(f[0], f[1]);
+    }
+}
+
+/* However early a march ends, its hit is the first solid to within its error: what its last step may have passed over
+   counts as well. */
+TEST(few_steps_bound_what_they_may_have_passed)
+{
+    float ball[2][2] = {{0.6f, 0.05f}, {0.2f, 0.3f}}, to[3] = {0, 0, -1};
+    dist_context *ctx = shape_context();
+    dist_field field;
+    int hits = 0, broken = 0, narrow = 0;
+    memset(&field, 0, sizeof field);
+    field.user = ball;
+    field.eval_fn = two_balls;
+    field.radius = 1;
+    field.detail = 0.02f;
+    for (int steps = 1; steps <= 12; steps++) {
+        for (int i = 0; i < 800; i++) {
+            float from[3] = {0, -0.2f + 0.0005f * (float)i, 1.5f};
+            dist_render_desc how = plain_how();
+            dist_hit hit;
+            how.max_steps = steps;
+            how.certified = i % 2;
+            CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, 1, from, to, &how, &hit, NULL), ctx);
+            if (hit.status != DIST_RAY_HIT) continue;
+            double first = 1e30;
+            for (int k = 0; k < 2; k++) {
+                double square = (double)ball[k][1] * (double)ball[k][1] - (double)from[1] * (double)from[1];
+                if (square > 0) first = fmin(first, 1.5 - (double)ball[k][0] - sqrt(square));
+            }
+            hits++;
+            if (first > 1e29) continue; /* within epsilon of an outline */
+            narrow += hit.error < 1e-4f;
+            broken += fabs((double)hit.distance - first) > (double)hit.error + 1e-4;
+        }
+    }
+    CHECK_EQUAL(0, broken);
+    CHECK(hits > 3000 && narrow > 2000);
+    if (test_state.verbose) printf("    %d hits, %d of them with an error below 1e-4\n", hits, narrow);
+    dist_context_destroy(ctx);
+}
+
+/* Beside a ball by less than floats can tell f may rise by noise alone where its slope is looked for. */
+TEST(no_error_is_below_0)
+{
+    dist_context *ctx = shape_context();
+    test_random r = test_random_seed(9);
+    int hits = 0, below = 0;
+    for (int k = 0; k < 20000; k++) {
+        double slope = pow(10, test_random_double(&r, -1.5, 0)), radius = pow(10, test_random_double(&r, -2.5, -0.2));
+        test_shape shape = shape_make(SHAPE_SPHERE, radius, 0, 0, 0);
+        float from[3] = {0, 0, -2}, to[3] = {0, 0, 1};
+        dist_render_desc how = plain_how();
+        dist_hit hit;
+        shape.slope = slope;
+        dist_field field = shape_field(&shape, 1, slope);
+        field.detail = (float)(0.5 * radius);
+        from[0] = (float)(radius + test_random_double(&r, -1e-6, 2e-6) / slope);
+        how.epsilon = k % 2 ? 1e-6f : 0.0f;
+        CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, 1, from, to, &how, &hit, NULL), ctx);
+        hits += hit.status == DIST_RAY_HIT;
+        below += hit.status == DIST_RAY_HIT && !(hit.error >= 0.0f && hit.error < 10.0f);
+    }
+    CHECK_EQUAL(0, below);
+    CHECK(hits > 5000);
+    dist_context_destroy(ctx);
+}
+
+/* A certified ray whose steps are spent just before a surface that it meets at a slope has not found a plateau. */
+TEST(certified_rays_out_of_steps_are_on_no_plateau)
+{
+    enum { BOXES = 8 };
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(SIDE, SIDE);
+    test_random r = test_random_seed(15);
+    int unresolved = 0;
+    for (int k = 0; k < 40; k++) {
+        float box[BOXES][6] = {{0}}, step[7] = {0};
+        dist_field one[BOXES];
+        dist_instance instance[BOXES];
+        memset(instance, 0, sizeof instance);
+        for (int i = 0; i < BOXES; i++) {
+            test_random_fill(&r, 3, box[i] + 3, 0.02f, 0.5f);
+            test_random_fill(&r, 3, step + 1, -3, 3);
+            one[i] = dist_field_box(box[i]);
+            instance[i].field = &one[i];
+            test_random_fill(&r, 3, instance[i].placement.translation, -0.5f, 0.5f);
+            dist_similarity_move(&instance[i].placement, step);
+        }
+        dist_scene *scene = dist_scene_create(ctx, BOXES, instance);
+        REQUIRE(scene != NULL);
+        dist_field field = dist_scene_field(scene);
+        dist_render_desc how = plain_how();
+        how.certified = 1;
+        how.max_steps = 6 + k % 20;
+        CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, &how, &picture_a), ctx);
+        CHECK_EQUAL(0, picture_a.stats.plateau);
+        unresolved += (int)picture_a.stats.unresolved;
+        dist_scene_destroy(scene);
+    }
+    CHECK(unresolved > 1000);
+    dist_context_destroy(ctx);
+}
+
 /* Pixels that a certified picture misses of those hit with a figure twice as large, in all of several views. */
 static int missed_of_net(dist_context *ctx, const dist_field *field, int *hits)
 {
@@ -2416,6 +2532,9 @@ int main(int argc, char **argv)
     RUN(the_paper_converges_up_to_slope_1_2_and_not_from_1_34_on);
     RUN(a_slope_beyond_the_lipschitz_figure_is_reported);
     RUN(a_solid_that_only_the_silhouette_finds_is_no_miss);
+    RUN(few_steps_bound_what_they_may_have_passed);
+    RUN(no_error_is_below_0);
+    RUN(certified_rays_out_of_steps_are_on_no_plateau);
     RUN(certified_pictures_of_nets_miss_nothing);
     RUN(bounds_reach_to_where_f_was_foretold_to_cross_and_over_what_is_flat);
     RUN(tiles_that_cost_most_last_time_come_first_and_change_nothing);

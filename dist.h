@@ -223,7 +223,9 @@ typedef struct dist_field {
        takes it for everything; gradients are the exact ones. Set by dist_shape_field after dist_net_set_half. */
     void (*coarse_fn)(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient);
     float coarse_error;
-    float center[3]; /* bounding sphere: the surface lies inside it, nothing is looked for outside */
+    /* bounding sphere: the surface lies inside it, nothing is looked for outside, nor is f asked for there, but by
+       DIST_TRACE_PAPER and, in the corners of its cube, dist_mesh_extract */
+    float center[3];
     float radius;    /* 1e-15 to 1e15 */
     float lipschitz;        /* bound or estimate of |grad f| where 0 < f < lipschitz_within; 0: 1 */
     float lipschitz_within; /* 0: clamp / 2; without a clamp radius / 20 */
@@ -1105,6 +1107,12 @@ static int disti_finite_double(double x)
     uint64_t bits;
     memcpy(&bits, &x, sizeof bits);
     return (bits & 0x7ff0000000000000u) != 0x7ff0000000000000u;
+}
+
+/* Not of what is not finite, which it does not compare: that would raise a floating-point exception. */
+static int disti_between(float x, float low, float high)
+{
+    return disti_finite(x) && x > low && x < high;
 }
 
 /* Beyond float's range its largest number. */
@@ -3955,7 +3963,7 @@ static void disti_cross(const double a[3], const double b[3], double c[3])
 DISTI_INLINE int disti_normalize(double a[3])
 {
     double length = sqrt(disti_dot(a, a));
-    if (!(length > 1e-150)) return 0;
+    if (!disti_finite_double(length) || length <= 1e-150) return 0;
     for (int i = 0; i < 3; i++) a[i] /= length;
     return 1;
 }
@@ -4698,15 +4706,15 @@ DIST_API dist_status dist_field_eikonal(dist_context *ctx, const dist_field *fie
         size_t count = DISTI_MIN(n - at, (size_t)DISTI_CHUNK), kept = 0;
         disti_field_eval_all(ctx, field, count, points + 3 * at, sdf, gradient);
         for (size_t i = 0; i < count; i++) {
-            float *g = gradient + 3 * i, length = disti_length(g[0], g[1], g[2]), factor = 0.0f;
-            if (disti_finite(sdf[i]) && disti_finite(length) && disti_finite_all(3, points + 3 * (at + i))) {
-                sum += ((double)length - 1.0) * ((double)length - 1.0);
-                if (length > 1e-12f) factor = 2.0f * weight * (1.0f - 1.0f / length) / (float)n;
-            }
-            if (!(factor < 0.0f || factor > 0.0f)) continue; /* 0 times what is not finite is none */
+            const float *p = points + 3 * (at + i), *g = gradient + 3 * i;
+            if (!disti_finite(sdf[i]) || !disti_finite_all(3, g) || !disti_finite_all(3, p)) continue;
+            double v[3] = {(double)g[0], (double)g[1], (double)g[2]}, length = sqrt(disti_dot(v, v));
+            double factor = length > 1e-12 ? 2.0 * (double)weight * (1.0 - 1.0 / length) / (double)n : 0.0;
+            sum += (length - 1.0) * (length - 1.0);
+            if (factor == 0.0) continue;
             for (size_t k = 0; k < 3; k++) {
-                where[3 * kept + k] = points[3 * (at + i) + k];
-                gradient[3 * kept + k] = factor * g[k];
+                where[3 * kept + k] = p[k];
+                gradient[3 * kept + k] = disti_within_float(factor * v[k]);
             }
             kept++;
         }
@@ -4714,7 +4722,7 @@ DIST_API dist_status dist_field_eikonal(dist_context *ctx, const dist_field *fie
             status = disti_field_second(ctx, field, kept, where, gradient, exact ? 0 : 2, 1e-3f * field->radius, NULL,
                                         d_code, grads->weights);
     }
-    if (status == DIST_OK && loss) *loss = (float)((double)weight * sum / (double)n);
+    if (status == DIST_OK && loss) *loss = disti_within_float((double)weight * sum / (double)n);
     if (status == DIST_OK && grads) disti_codes_add(field, grads, d_code);
     return status;
 }
@@ -5756,11 +5764,11 @@ DIST_API dist_status dist_scene_find(dist_scene *scene, size_t n, const float *p
 
 DIST_API void dist_similarity_move(dist_similarity *placement, const float step[7])
 {
-    float zero[9] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
+    int turned = 0;
     if (!placement || !step || !disti_finite_all(7, step)) return;
     if (placement->scale == 0.0f) placement->scale = 1.0f;
-    if (memcmp(placement->rotation, zero, sizeof zero) == 0)
-        placement->rotation[0] = placement->rotation[4] = placement->rotation[8] = 1.0f;
+    for (int i = 0; i < 9; i++) turned |= !disti_finite(placement->rotation[i]) || placement->rotation[i] != 0.0f;
+    if (!turned) placement->rotation[0] = placement->rotation[4] = placement->rotation[8] = 1.0f;
     double scale = (double)placement->scale * exp(DISTI_MIN(DISTI_MAX((double)step[0], -200.0), 200.0));
     if (placement->scale > 0.0f) placement->scale = (float)(scale < 1e-30 ? 1e-30 : scale > 1e30 ? 1e30 : scale);
     disti_turn(step + 1, placement->rotation);
@@ -9817,17 +9825,16 @@ DIST_API dist_camera dist_camera_look_at(int width, int height, float fov_y, con
                                          const float up[3])
 {
     dist_camera camera;
-    double m[9], center[3], down[3] = {0.0, -1.0, 0.0};
+    double m[9], center[3], down[3] = {0.0, -1.0, 0.0}, focal = 0.0;
+    int good = (!eye || disti_finite_all(3, eye)) && (!at || disti_finite_all(3, at)) && (!up || disti_finite_all(3, up));
     memset(&camera, 0, sizeof camera);
     camera.width = width;
     camera.height = height;
-    if (fov_y > 0.0f && fov_y < 3.14159265f) /* else 0, as below: refused by whoever takes the camera */
-        camera.fx = camera.fy = (float)(height / 2.0 / tan((double)fov_y / 2.0));
-    if (!disti_finite(camera.fx)) camera.fx = camera.fy = 0.0f;
+    if (!good) eye = at = up = NULL;
+    if (good && disti_between(fov_y, 0.0f, 3.14159265f)) focal = height / 2.0 / tan((double)fov_y / 2.0);
+    if (fabs(focal) < 3.4e38) camera.fx = camera.fy = (float)focal; /* else 0: refused by whoever takes the camera */
     camera.cx = (float)((width - 1.0) / 2.0);
     camera.cy = (float)((height - 1.0) / 2.0);
-    if ((eye && !disti_finite_all(3, eye)) || (at && !disti_finite_all(3, at)) || (up && !disti_finite_all(3, up)))
-        camera.fx = 0.0f;
     for (int i = 0; i < 3; i++) {
         center[i] = eye ? (double)eye[i] : 0.0;
         m[6 + i] = (at ? (double)at[i] : 0.0) - center[i];
@@ -9850,12 +9857,14 @@ DIST_API dist_camera dist_camera_look_at(int width, int height, float fov_y, con
 /* OpenGL's camera axes are ours with y and z turned over: R = (diag(1, -1, -1)) (rotation of camera_to_world)^T. */
 DIST_API void dist_camera_set_opengl(dist_camera *camera, const float camera_to_world[12])
 {
-    double m[9], center[3];
+    double m[9], center[3], determinant;
     if (!camera || !camera_to_world) return;
     for (int i = 0; i < 3; i++) {
         for (int j = 0; j < 3; j++) m[3 * i + j] = (double)camera_to_world[4 * j + i] * (i == 0 ? 1.0 : -1.0);
         center[i] = (double)camera_to_world[4 * i + 3];
     }
+    if (disti_finite_all(12, camera_to_world) && disti_rotation_off(m, &determinant) <= 1e-3 && determinant > 0.0)
+        disti_orthonormalize(m); /* as every reader will: so the place stays */
     disti_camera_place(camera, m, center);
 }
 
@@ -12400,7 +12409,7 @@ static dist_status disti_foot_run(disti_foot_job *job, const char *function, con
                                       : job->contacts ? "%s: spheres is NULL"
                                                       : "%s: points is NULL", function);
     for (size_t i = 0; i < job->n && job->contacts; i++)
-        if (job->points[4 * i + 3] < 0.0f)
+        if (disti_finite(job->points[4 * i + 3]) && job->points[4 * i + 3] < 0.0f)
             return disti_fail(job->ctx, DIST_BAD_ARGUMENT, "%s: the radius of sphere %d is %d, must be 0 or positive",
                               function, (double)i, (double)job->points[4 * i + 3]);
     disti_run(job->ctx, (int)((job->n + DISTI_FEET - 1) / DISTI_FEET), disti_foot_task, job);
@@ -12493,7 +12502,10 @@ static void disti_tile_rays(const disti_tracer *tracer, const disti_tile *tile, 
 
 /* Cones: a block of pixels marches as one while the sphere that f / L proves empty is wider than the block's cone
    there; then its children start where it stopped. Safe for anything, however thin, under the Lipschitz bound: every
-   point of every ray of the block before the stop lies in one of the empty spheres. */
+   point of every ray of the block before the stop lies in one of the empty spheres. Outside the bounding sphere f says
+   nothing: where the axis passes by at a distance o, f is asked for at the point of the sphere nearest to it. If the
+   ball of radius E about that is empty, so is one of radius sqrt(o^2 + E^2) about the axis: all of the bounding sphere
+   that lies nearer to the axis's point is nearer to the sphere's than E, as it lies behind the plane that touches there. */
 typedef struct disti_cone {
     float origin[3], direction[3]; /* of the axis, as of a ray */
     double base;
@@ -12506,6 +12518,7 @@ typedef struct disti_cone {
     int state;    /* DISTI_CONE_* */
     int steps;
     float f;      /* last sample */
+    float out;    /* how far outside the bounding sphere the axis is there */
     double least_t; /* where the block's axes had the least f, and that f */
     float least_f;
 } disti_cone;
@@ -12577,26 +12590,35 @@ static void disti_cone_init(const disti_tracer *tracer, const disti_tile *tile, 
                                                                              : DISTI_CONE_MARCHES;
 }
 
-static void disti_cone_point(const disti_cone *cone, float p[3])
+/* Where f is asked for a cone at cone->t. */
+static void disti_cone_point(const dist_field *field, disti_cone *cone, float p[3])
 {
     float s = (float)(cone->t - cone->base);
-    for (int i = 0; i < 3; i++) p[i] = cone->origin[i] + s * cone->direction[i];
+    double d[3], radius = (double)field->radius;
+    for (int i = 0; i < 3; i++) {
+        p[i] = cone->origin[i] + s * cone->direction[i];
+        d[i] = (double)p[i] - (double)field->center[i];
+    }
+    double square = disti_dot(d, d), length = square > radius * radius ? sqrt(square) : radius;
+    cone->out = (float)(length - radius);
+    if (length <= radius) return;
+    for (int i = 0; i < 3; i++) p[i] = (float)((double)field->center[i] + d[i] * (radius / length));
 }
 
-/* One sample at the cone's axis, and the state that follows from it. */
+/* One sample for the cone, and the state that follows from it. */
 static int disti_cone_advance(const disti_tracer *tracer, disti_cone *cone, float f)
 {
     cone->f = f;
     if (!disti_finite(f) || ++cone->steps > 64) return DISTI_CONE_BLOCKED;
     /* on the plateau of a clamped field, where samples are equal, the one nearest to the center */
     int level = !(f > cone->least_f) && fabs(cone->t - cone->base) < fabs(cone->least_t - cone->base);
-    if (f < cone->least_f || level) {
+    if ((f < cone->least_f || level) && !(cone->out > 0.0f)) {
         cone->least_f = f;
         cone->least_t = cone->t;
     }
     float margin = tracer->epsilon > 0.0f ? tracer->epsilon : disti_default_epsilon(tracer);
-    double radius = (double)disti_empty(tracer, f - margin);
-    double wide = cone->t * cone->sine;
+    double radius = (double)disti_empty(tracer, f - margin), out = (double)cone->out, wide = cone->t * cone->sine;
+    if (out > 0.0) radius = sqrt(out * out + DISTI_MAX(radius, 0.0) * DISTI_MAX(radius, 0.0));
     if (radius < 1.05 * cone->t * cone->chord || radius <= wide) return DISTI_CONE_BLOCKED;
     double t = cone->t * cone->cosine + sqrt(radius * radius - wide * wide);
     if (t - cone->t < 1e-3 * (double)tracer->field->radius) return DISTI_CONE_BLOCKED;
@@ -12605,9 +12627,9 @@ static int disti_cone_advance(const disti_tracer *tracer, disti_cone *cone, floa
 }
 
 /* What a cone leaves: rays of a block that is through are misses; the others start at the block's stop, where f is
-   at most the axis's sample plus the Lipschitz figure times how far they are from the axis. */
+   at most the cone's sample plus the Lipschitz figure times how far they are from where that was taken. */
 static void disti_cone_finish(const disti_tracer *tracer, const disti_tile *tile, const disti_bench *bench,
-                              const disti_cone *cone)
+                              disti_cone *cone)
 {
     int x1 = disti_block_end(cone->x, cone->size, tile->own_width, tile->width);
     int y1 = disti_block_end(cone->y, cone->size, tile->own_height, tile->height);
@@ -12620,7 +12642,7 @@ static void disti_cone_finish(const disti_tracer *tracer, const disti_tile *tile
         }
     }
     float axis[3], p[3];
-    disti_cone_point(cone, axis);
+    disti_cone_point(tracer->field, cone, axis);
     for (int y = cone->y; y < y1; y++) {
         for (int x = cone->x; x < x1; x++) {
             disti_ray *ray = &bench->rays[y * tile->width + x];
@@ -12675,7 +12697,8 @@ static void disti_cone_rounds(const disti_tracer *tracer, int worker, const dist
 {
     disti_cone *cones = (disti_cone *)(void *)bench->rest;
     while (active > 0) {
-        for (size_t i = 0; i < active; i++) disti_cone_point(&cones[bench->index[i]], bench->points + 3 * i);
+        for (size_t i = 0; i < active; i++) 
+            disti_cone_point(tracer->field, &cones[bench->index[i]], bench->points + 3 * i);
         size_t asked = disti_query(tracer, worker, bench, active), all = active, kept = 0;
         bench->stats->cone_queries += asked;
         for (size_t i = 0; i < active; i++) { /* children go behind all others in the list */
@@ -12715,7 +12738,7 @@ static int disti_cones(const disti_tracer *tracer, int worker, const disti_tile 
     for (int i = 0; i < bench->cones; i++) blocked += cones[i].state == DISTI_CONE_BLOCKED;
     if (tile->lazy && blocked == 0) return 0;
     for (int i = 0; i < bench->cones; i++) {
-        const disti_cone *cone = &cones[i];
+        disti_cone *cone = &cones[i];
         int x1 = disti_block_end(cone->x, cone->size, tile->own_width, tile->width);
         int y1 = disti_block_end(cone->y, cone->size, tile->own_height, tile->height);
         if (cone->state == DISTI_CONE_SPLIT) continue;
@@ -16458,7 +16481,7 @@ DIST_API float dist_loss_photometric(const dist_photo *to, const dist_photo *fro
     double sum[4] = {0.0, 0.0, 0.0, 0.0}, again[4] = {0.0, 0.0, 0.0, 0.0}, scale[2], d_pose[12], turned[3];
     float ssim = desc ? desc->ssim : 0.0f, visibility = desc ? desc->visibility : 0.0f;
     if (!to || !from || !to->color || !to->depth || !from->color) return 0.0f;
-    if (!(ssim >= 0.0f && ssim <= 1.0f) || !disti_finite(visibility)) return 0.0f;
+    if (!disti_finite(ssim) || ssim < 0.0f || ssim > 1.0f || !disti_finite(visibility)) return 0.0f;
     if (disti_camera_check(NULL, &to->camera, "") != DIST_OK || disti_camera_check(NULL, &from->camera, "") != DIST_OK)
         return 0.0f;
     if (!disti_finite(weight)) weight = 0.0f; /* what is seen is told all the same */
@@ -16495,9 +16518,9 @@ DIST_API size_t dist_adam_step(dist_adam *adam, size_t n, float *x, const float 
     size_t skipped = 0;
     if (!adam || !adam->moments || !x || !gradient || !disti_finite(adam->rate)) return n;
     double rate = adam->rate < 0.0f ? 0.0 : (adam->rate > 0.0f ? (double)adam->rate : 1e-2);
-    double beta1 = adam->beta1 > 0.0f && adam->beta1 < 1.0f ? (double)adam->beta1 : 0.9;
-    double beta2 = adam->beta2 > 0.0f && adam->beta2 < 1.0f ? (double)adam->beta2 : 0.999;
-    double epsilon = adam->epsilon > 0.0f ? (double)adam->epsilon : 1e-8;
+    double beta1 = disti_between(adam->beta1, 0.0f, 1.0f) ? (double)adam->beta1 : 0.9;
+    double beta2 = disti_between(adam->beta2, 0.0f, 1.0f) ? (double)adam->beta2 : 0.999;
+    double epsilon = disti_between(adam->epsilon, 0.0f, 3.4e38f) ? (double)adam->epsilon : 1e-8;
     if (adam->step < 0) adam->step = 0;
     if (adam->step < 0x7fffffff) adam->step++;
     double correction1 = 1.0 - pow(beta1, (double)adam->step);
@@ -16774,8 +16797,10 @@ static int disti_extract_mark(disti_extract *x, size_t slab)
         size_t n = DISTI_MIN(total - from, (size_t)DISTI_MESH_BATCH);
         for (size_t i = 0; i < n; i++) {
             size_t at[3] = {(from + i) % x->blocks, (from + i) / x->blocks, slab};
-            for (int k = 0; k < 3; k++)
-                x->batch[3 * i + (size_t)k] = disti_extract_coordinate(x, k, (double)(at[k] * x->block) + half);
+            for (int k = 0; k < 3; k++) { /* the middle of what lies in the cube */
+                size_t begin = at[k] * x->block, end = DISTI_MIN(begin + x->block, x->cells);
+                x->batch[3 * i + (size_t)k] = disti_extract_coordinate(x, k, 0.5 * (double)(begin + end));
+            }
         }
         if (!disti_extract_eval(x, n)) return 0;
         for (size_t i = 0; i < n; i++) {
@@ -17030,7 +17055,7 @@ static void disti_mesh_seed(void *user, size_t first, size_t count, const float 
             dot += (double)g[k] * (double)d_v[k];
             square += (double)g[k] * (double)g[k];
         }
-        d_sdf[i] = disti_finite_all(3, g) && square > 0.0 ? (float)(-dot / square) : 0.0f;
+        d_sdf[i] = disti_finite_all(3, g) && square > 0.0 ? disti_within_float(-dot / square) : 0.0f;
     }
 }
 

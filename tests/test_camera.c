@@ -213,6 +213,40 @@ TEST(opengl_goes_there_and_back)
     }
 }
 
+/* A matrix of three to five digits, as a text file has them: its rows are not quite orthonormal, and its last column is
+   where the camera stands all the same. */
+TEST(opengl_of_few_digits_stands_where_it_says)
+{
+    test_random r = test_random_seed(16);
+    for (int k = 0; k < 200; k++) {
+        dist_camera c = plain_camera(), back = plain_camera();
+        double digits = k % 2 ? 4e3 : 1e5;
+        float m[12], again[12];
+        random_pose(&r, &c);
+        dist_camera_get_opengl(&c, m);
+        for (int i = 0; i < 12; i++)
+            if (i % 4 < 3) m[i] = (float)(floor((double)m[i] * digits + 0.5) / digits);
+            else m[i] *= 5;
+        dist_camera_set_opengl(&back, m);
+        dist_camera_get_opengl(&back, again);
+        for (int i = 0; i < 3; i++) CHECK_NEAR(m[4 * i + 3], again[4 * i + 3], 1e-5);
+        for (int i = 0; i < 12; i++)
+            if (i % 4 < 3) CHECK_NEAR(m[i], again[i], 2e-3);
+    }
+    dist_context *ctx = test_context(); /* a mirror stays one, and is refused */
+    const float mirror[12] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, -1, 3};
+    float ball[4] = {0, 0, 0, 0.5f}, depth[64];
+    dist_field field = dist_field_sphere(ball);
+    dist_camera c = dist_camera_look_at(8, 8, 0.7f, NULL, NULL, NULL);
+    dist_images out;
+    memset(&out, 0, sizeof out);
+    out.depth = depth;
+    dist_camera_set_opengl(&c, mirror);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_render(ctx, &field, &c, NULL, &out, NULL), ctx);
+    CHECK_TEXT("not a rotation", dist_context_message(ctx));
+    dist_context_destroy(ctx);
+}
+
 TEST(opengl_looks_along_minus_z_with_y_up)
 {
     dist_camera c = plain_camera();
@@ -424,6 +458,7 @@ int main(int argc, char **argv)
     RUN(rays_are_those_of_double);
     RUN(pixel_center_shifts_rays_by_half_a_pixel);
     RUN(opengl_goes_there_and_back);
+    RUN(opengl_of_few_digits_stands_where_it_says);
     RUN(opengl_looks_along_minus_z_with_y_up);
     RUN(colmap_goes_there_and_back_in_every_branch);
     RUN(a_zero_quaternion_is_refused);

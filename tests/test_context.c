@@ -686,6 +686,72 @@ static unsigned state_get(void)
 }
 #endif
 
+/* Steeper than a float's square. */
+static void steep_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    (void)user;
+    (void)worker;
+    for (size_t i = 0; i < n; i++) {
+        sdf[i] = 1e30f * points[3 * i];
+        for (int k = 0; gradient && k < 3; k++) gradient[3 * i + (size_t)k] = k == 0 ? 1e30f : 0.0f;
+    }
+}
+
+/* With traps on, what is not finite is told, or counted, by functions that run on the caller's own state, and traps
+   nothing. */
+TEST(what_is_not_finite_traps_nothing)
+{
+    const uint32_t bits = 0x7fc00000u;
+    float nan, ball[4] = {0, 0, 0, 0.5f}, points[6] = {0.1f, 0.2f, 0.3f, 0.4f, 0.5f, 0.6f}, x[2] = {1, 2}, loss;
+    float moments[4] = {0, 0, 0, 0}, gradient[2] = {1, 1}, step[7] = {0, 0, 0, 0, 0, 0, 0}, m[12];
+    memcpy(&nan, &bits, sizeof nan);
+    dist_context *ctx = shape_context();
+    dist_field field = dist_field_sphere(ball);
+    field.eval_fn = steep_eval;
+    float bad[3] = {nan, 0, 1}, sphere[4] = {0, 0, 1, nan}, turned[9] = {nan, 0, 0, 0, 0, 0, 0, 0, 0};
+    dist_contact contact;
+    dist_similarity place;
+    dist_adam adam;
+    memset(&place, 0, sizeof place);
+    memcpy(place.rotation, turned, sizeof turned);
+    memset(&adam, 0, sizeof adam);
+    adam.moments = moments;
+    adam.beta1 = adam.beta2 = adam.epsilon = nan;
+    for (int i = 0; i < 12; i++) m[i] = nan;
+    float colors[48], depth[16];
+    dist_photo photo;
+    dist_photometric_desc how;
+    memset(&photo, 0, sizeof photo);
+    memset(&how, 0, sizeof how);
+    for (int i = 0; i < 48; i++) colors[i] = 0.5f;
+    for (int i = 0; i < 16; i++) depth[i] = 1;
+    photo.camera = dist_camera_look_at(4, 4, 0.7f, NULL, NULL, NULL);
+    photo.color = colors;
+    photo.depth = depth;
+    how.ssim = points[4] = nan;
+    state_set(STATES > 5 ? 5 : 0);
+    dist_camera cameras[5] = {
+        dist_camera_look_at(4, 4, nan, NULL, NULL, NULL), dist_camera_look_at(4, 4, 1e-45f, NULL, NULL, NULL),
+        dist_camera_look_at(4, 4, 0.7f, bad, NULL, NULL), dist_camera_look_at(4, 4, 0.7f, NULL, bad, NULL),
+        dist_camera_look_at(4, 4, 0.7f, NULL, NULL, bad)};
+    dist_camera_set_opengl(&cameras[0], m);
+    dist_similarity_move(&place, step);
+    dist_status status = dist_field_collide(ctx, &field, 1, sphere, &contact);
+    size_t skipped = dist_adam_step(&adam, 2, x, gradient);
+    float none = dist_loss_photometric(&photo, &photo, &how, 1, NULL, NULL);
+    dist_status term = dist_field_eikonal(ctx, &field, 2, points, 3e38f, &loss, NULL);
+    state_set(0);
+    CHECK(none == 0.0f);
+    CHECK_STATUS(DIST_OK, term, ctx);
+    CHECK(loss > 3e38f);
+    for (int k = 1; k < 5; k++) CHECK(cameras[k].fx == 0.0f);
+    CHECK_STATUS(DIST_OK, status, ctx);
+    CHECK_EQUAL(DIST_RAY_NOT_FINITE, contact.status);
+    CHECK_EQUAL(0, skipped);
+    CHECK(x[0] < 1 && x[1] < 2);
+    dist_context_destroy(ctx);
+}
+
 #ifdef OWN_STACKS
 /* A scheduler whose tasks run on a stack of its own, which tells how much of it they used. */
 enum { STACK = 1 << 17, MARK = 0xa5 };
@@ -854,6 +920,7 @@ int main(int argc, char **argv)
     RUN(a_refused_context_tells_its_logger);
     RUN(objects_of_another_context_are_refused);
     RUN(tasks_fit_on_small_stacks);
+    RUN(what_is_not_finite_traps_nothing);
     RUN(the_callers_floating_point_state_neither_matters_nor_changes);
     return test_report();
 }

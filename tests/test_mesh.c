@@ -393,6 +393,49 @@ TEST(a_field_that_is_not_finite_is_refused)
     dist_context_destroy(ctx);
 }
 
+/* A distance in its cube, NaN beyond. */
+static void cube_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    const uint32_t nan = 0x7fc00000u;
+    long *outside = (long *)user; /* one worker */
+    (void)worker;
+    (void)gradient;
+    for (size_t i = 0; i < n; i++, points += 3) {
+        double square = 0;
+        int within = 1;
+        for (int k = 0; k < 3; k++) {
+            square += (double)points[k] * (double)points[k];
+            within &= fabsf(points[k]) < 1.00001f;
+        }
+        sdf[i] = (float)(sqrt(square) - 0.9);
+        *outside += !within;
+        if (!within) memcpy(&sdf[i], &nan, sizeof nan);
+    }
+}
+
+TEST(nothing_is_asked_outside_the_cube)
+{
+    dist_context_desc context_desc = test_context_desc();
+    context_desc.workers = 1;
+    dist_context *ctx = dist_context_create(&context_desc);
+    long outside = 0;
+    dist_field field;
+    memset(&field, 0, sizeof field);
+    field.user = &outside;
+    field.eval_fn = cube_eval;
+    field.radius = 1;
+    for (int resolution = 2; resolution <= 41; resolution++) {
+        dist_mesh_desc desc = mesh_desc(resolution);
+        dist_mesh *mesh = dist_mesh_extract(ctx, &field, &desc);
+        REQUIRE(mesh != NULL);
+        CHECK(mesh_closed(mesh));
+        CHECK_NEAR(4.18879 * 0.729, mesh_volume(mesh, NULL), 3.4 * 4 / (resolution * resolution));
+        dist_mesh_destroy(mesh);
+    }
+    CHECK_EQUAL(0, outside);
+    dist_context_destroy(ctx);
+}
+
 TEST(extraction_gives_the_same_bits_for_every_worker_count)
 {
     dist_field field = dist_field_torus(torus_numbers);
@@ -875,6 +918,7 @@ int main(int argc, char **argv)
     RUN(an_empty_surface_is_a_mesh_of_nothing);
     RUN(bad_descs_and_fields_are_refused);
     RUN(a_field_that_is_not_finite_is_refused);
+    RUN(nothing_is_asked_outside_the_cube);
     RUN(extraction_gives_the_same_bits_for_every_worker_count);
     RUN(mesh_adjoint_is_the_central_difference_of_moving_vertices);
     RUN(the_mesh_adjoint_reaches_the_weights);

@@ -1326,6 +1326,85 @@ TEST(pixels_not_asked_for_give_no_gradient)
 }
 #endif
 
+/* A distance within its bounding sphere, about (.2, -.1, .3), and a large number, or NaN, outside: how many times it was
+   asked for there. */
+typedef struct inner_ball {
+    float center[3], outside;
+    long asked_outside;
+} inner_ball;
+
+static void inner_ball_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    inner_ball *ball = (inner_ball *)user; /* one worker */
+    (void)worker;
+    for (size_t i = 0; i < n; i++) {
+        double d[3], length = 0;
+        for (int k = 0; k < 3; k++) {
+            d[k] = (double)points[3 * i + (size_t)k] - (double)ball->center[k];
+            length += d[k] * d[k];
+        }
+        length = sqrt(length);
+        ball->asked_outside += length > 1 + 1e-6;
+        sdf[i] = length > 1 + 1e-6 ? ball->outside : (float)(length - 0.9);
+        for (int k = 0; gradient && k < 3; k++) gradient[3 * i + (size_t)k] = (float)(d[k] / fmax(length, 1e-6));
+    }
+}
+
+/* Nothing is asked outside the bounding sphere, by rays, cones, warm starts and silhouettes, and so whatever f is there
+   the picture is the same: a grid has no values there, and a lookup's default is no distance. */
+TEST(what_f_is_outside_the_bounding_sphere_does_not_matter)
+{
+    const uint32_t nan_bits = 0x7fc00000u;
+    static const int sizes[4][2] = {{47, 1}, {32, 20}, {128, 96}, {1, 64}};
+    static float depth[2][128 * 96], silhouette[2][128 * 96];
+    static unsigned char status[2][128 * 96];
+    dist_context_desc one = {0};
+    one.workers = 1;
+    dist_context *ctx = dist_context_create(&one);
+    inner_ball ball;
+    dist_field field;
+    memset(&ball, 0, sizeof ball);
+    ball.center[0] = 0.2f;
+    ball.center[1] = -0.1f;
+    ball.center[2] = 0.3f;
+    memset(&field, 0, sizeof field);
+    field.user = &ball;
+    field.eval_fn = inner_ball_eval;
+    memcpy(field.center, ball.center, sizeof field.center);
+    field.radius = 1;
+    for (int k = 0; k < 4 * 3 * 5; k++) {
+        const int *size = sizes[k % 4];
+        float far_off = k / 4 % 3 == 0 ? 2.2f : k / 4 % 3 == 1 ? 1.05f : 0.95f, eye[3];
+        for (int i = 0; i < 3; i++) eye[i] = ball.center[i] + far_off * (i == 2 ? -0.8f : i == 1 ? 0.6f : 0);
+        dist_camera camera = dist_camera_look_at(size[0], size[1], k % 5 ? 1.0f : 2.5f, eye, ball.center, NULL);
+        dist_render_desc how;
+        memset(&how, 0, sizeof how);
+        how.certified = k / 12 == 1;
+        how.no_cones = k / 12 == 2;
+        how.warm_start = k / 12 == 3;
+        size_t n = (size_t)size[0] * (size_t)size[1];
+        ball.asked_outside = 0;
+        for (int j = 0; j < 3; j++) {
+            dist_images out;
+            memset(&out, 0, sizeof out);
+            out.depth = depth[j > 0];
+            out.status = status[j > 0];
+            if (k / 12 != 4) out.silhouette = silhouette[j > 0];
+            ball.outside = j == 0 ? 0.3f : 1000.0f;
+            if (j == 2) memcpy(&ball.outside, &nan_bits, sizeof nan_bits);
+            dist_tape *tape = dist_tape_create(ctx, &camera, &how);
+            for (int again = 0; again < 1 + how.warm_start; again++)
+                CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, tape), ctx);
+            dist_tape_destroy(tape);
+            CHECK(memcmp(depth[0], depth[j > 0], n * sizeof(float)) == 0);
+            CHECK(memcmp(status[0], status[j > 0], n) == 0);
+            if (out.silhouette) CHECK(memcmp(silhouette[0], silhouette[j > 0], n * sizeof(float)) == 0);
+        }
+        CHECK_EQUAL(0, ball.asked_outside);
+    }
+    dist_context_destroy(ctx);
+}
+
 /* ---- how.max_queries -------------------------------------------------------------------------------------------- */
 
 /* Whatever the budget: it is kept, what is called a hit is one, what is called a miss is one, and a surface is no
@@ -1669,6 +1748,7 @@ int main(int argc, char **argv)
 #ifndef DIST_NO_BACKWARD
     RUN(pixels_not_asked_for_give_no_gradient);
 #endif
+    RUN(what_f_is_outside_the_bounding_sphere_does_not_matter);
     RUN(a_query_budget_is_kept_and_more_of_it_finds_more);
     RUN(a_query_budget_gives_the_same_bits_for_every_number_of_workers);
     RUN(extreme_budgets_give_the_best_so_far_and_leave_no_trace);

@@ -596,6 +596,15 @@ TEST(eikonal_term_of_a_field_without_second_derivatives_is_by_differences)
         CHECK_STATUS(DIST_OK, dist_field_eikonal(ctx, &field, MANY, points, weight, NULL, &grads), ctx);
         CHECK_NEAR(1.2, (double)code[0] / (double)weight, 4e-4);
     }
+    CHECK_STATUS(DIST_OK, dist_field_eikonal(ctx, &field, MANY, points, 3e38f, &loss, NULL), ctx);
+    CHECK_NEAR(3e38 * 0.36, (double)loss, 1e33);
+    numbers[0] = 1e25f; /* steeper than a float's square: it adds what it adds, or the largest float */
+    CHECK_STATUS(DIST_OK, dist_field_eikonal(ctx, &field, MANY, points, 1e-30f, &loss, NULL), ctx);
+    CHECK_NEAR(1e20, (double)loss, 1e14);
+    code[0] = 0.0f;
+    CHECK_STATUS(DIST_OK, dist_field_eikonal(ctx, &field, MANY, points, 1.0f, &loss, &grads), ctx);
+    CHECK(loss > 3e38f);
+    CHECK(code[0] > 1e24f && code[0] < 3e25f);
     dist_context_destroy(ctx);
 }
 

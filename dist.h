@@ -9826,7 +9826,8 @@ DIST_API dist_camera dist_camera_look_at(int width, int height, float fov_y, con
 {
     dist_camera camera;
     double m[9], center[3], down[3] = {0.0, -1.0, 0.0}, focal = 0.0;
-    int good = (!eye || disti_finite_all(3, eye)) && (!at || disti_finite_all(3, at)) && (!up || disti_finite_all(3, up));
+    int good = (!eye || disti_finite_all(3, eye)) && (!at || disti_finite_all(3, at));
+    good = good && (!up || disti_finite_all(3, up));
     memset(&camera, 0, sizeof camera);
     camera.width = width;
     camera.height = height;
@@ -12504,8 +12505,8 @@ static void disti_tile_rays(const disti_tracer *tracer, const disti_tile *tile, 
    there; then its children start where it stopped. Safe for anything, however thin, under the Lipschitz bound: every
    point of every ray of the block before the stop lies in one of the empty spheres. Outside the bounding sphere f says
    nothing: where the axis passes by at a distance o, f is asked for at the point of the sphere nearest to it. If the
-   ball of radius E about that is empty, so is one of radius sqrt(o^2 + E^2) about the axis: all of the bounding sphere
-   that lies nearer to the axis's point is nearer to the sphere's than E, as it lies behind the plane that touches there. */
+   ball of radius E about that is empty, so is one of radius sqrt(o^2 + E^2) about the axis: what of the bounding sphere
+   lies nearer than that to the axis's point lies nearer than E to the sphere's, behind the plane that touches there. */
 typedef struct disti_cone {
     float origin[3], direction[3]; /* of the axis, as of a ray */
     double base;
@@ -12697,7 +12698,7 @@ static void disti_cone_rounds(const disti_tracer *tracer, int worker, const dist
 {
     disti_cone *cones = (disti_cone *)(void *)bench->rest;
     while (active > 0) {
-        for (size_t i = 0; i < active; i++) 
+        for (size_t i = 0; i < active; i++)
             disti_cone_point(tracer->field, &cones[bench->index[i]], bench->points + 3 * i);
         size_t asked = disti_query(tracer, worker, bench, active), all = active, kept = 0;
         bench->stats->cone_queries += asked;

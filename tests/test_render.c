@@ -1326,8 +1326,7 @@ TEST(pixels_not_asked_for_give_no_gradient)
 }
 #endif
 
-/* A distance within its bounding sphere, about (.2, -.1, .3), and a large number, or NaN, outside: how many times it was
-   asked for there. */
+/* A distance within its bounding sphere, and what one likes outside: how many times it was asked for there. */
 typedef struct inner_ball {
     float center[3], outside;
     long asked_outside;

@@ -236,6 +236,8 @@ typedef struct dist_field {
     float clamp;     /* |f| above this carries no distance (a clamped training); 0: none */
     float detail;    /* the radius of the smallest part that is to be found: the defaults of how.epsilon, normal_delta
                         and of how far a ray goes on trust go by it; 0: radius */
+    float noise;     /* how far rounding takes f off, which no hit's error is below: counted as 5e-7 of the radius where
+                        that is more. A net's is sampled by dist_shape_create */
     /* multiply-adds of a query, about; a net's field has its own. Below 5000 a picture without silhouette and tape is
        traced with more queries and less bookkeeping: 1 where frames a second count, 0 where queries do */
     float cost;
@@ -4239,7 +4241,7 @@ static dist_status disti_field_check(dist_context *ctx, const dist_field *field,
         {"field.certified_far", (double)field->certified_far, 0, 3e38},
         {"field.cost", (double)field->cost, 0, 3e38}, {"field.code_size", (double)field->code_size, 0, 3e38},
         {"field.color_code_size", (double)field->color_code_size, 0, 3e38},
-        {"field.coarse_error", (double)field->coarse_error, 0, 3e38}};
+        {"field.coarse_error", (double)field->coarse_error, 0, 3e38}, {"field.noise", (double)field->noise, 0, 3e38}};
     dist_status status = disti_limits(ctx, function, sizeof limits / sizeof limits[0], limits);
     if (status != DIST_OK) return status;
     if (field->owner && field->owner != ctx) return disti_refuse(ctx, "%s: field belongs to another context", function);
@@ -5688,6 +5690,7 @@ DIST_API dist_field dist_scene_field(dist_scene *scene)
         if (!(field.detail > 0.0f && field.detail < detail)) field.detail = detail;
         float within = disti_far_from(f) * scene->placed[k].scale;
         if (!(field.lipschitz_within > 0.0f && field.lipschitz_within < within)) field.lipschitz_within = within;
+        field.noise = DISTI_MAX(field.noise, f->noise * scene->placed[k].scale);
         field.lipschitz = DISTI_MAX(field.lipschitz, f->lipschitz);
         field.lipschitz_far = DISTI_MAX(field.lipschitz_far, disti_steepest(f));
         field.certified = DISTI_MAX(field.certified, f->certified);
@@ -6622,7 +6625,7 @@ struct dist_shape {
     disti_kernels kernels; /* of the context's instructions */
     float *code;
     float *bias; /* (layers + 1, max_rows): each layer's bias with the code folded in; then zeros, for tangents */
-    float lipschitz, lipschitz_far, certified, certified_far;
+    float lipschitz, lipschitz_far, certified, certified_far, noise;
     float half_error; /* largest of 16 bits at the samples of disti_shape_slope */
     int half;         /* what the net had then */
     unsigned changes; /* of the code, so far */
@@ -8334,17 +8337,52 @@ static float disti_coarse_apart(const dist_field *field, const float *points, co
     return most;
 }
 
+enum { DISTI_BENDS = DISTI_BLOCK / 3 };
+
+/* |f(p) - 2 f(p + h) + f(p + 2 h)| at some of these points, each moved to a multiple of h, so that no point is rounded:
+   what rounding does to f, as h is so small, 2^-20 of the radius, that f's own bends are no part of it. If the radius
+   is less than 1, h is 2^-20, to 2^-10 of the radius: the net's hidden values, whose size the radius is not, would be
+   the same otherwise. */
+static void disti_shape_bends(const dist_field *field, const float *points, float *bends)
+{
+    float at[3 * DISTI_BLOCK], f[DISTI_BLOCK], power;
+    uint32_t bits;
+    memcpy(&bits, &field->radius, sizeof bits);
+    bits &= 0x7f800000u; /* a power of 2 */
+    memcpy(&power, &bits, sizeof power);
+    float h = DISTI_MIN(DISTI_MAX(power, 1.0f) / 1048576.0f, power / 1024.0f);
+    for (int j = 0; j < DISTI_BLOCK; j++)
+        for (int k = 0; k < 3; k++)
+            at[3 * j + k] = h * (floorf(points[3 * (j / 3) + k] / h) + (k == j / 3 % 3 ? (float)(j % 3) : 0.0f));
+    field->eval_fn(field->user, 0, DISTI_BLOCK, at, f, NULL);
+    for (int j = 0; j < DISTI_BENDS; j++)
+        bends[j] = fabsf(f[3 * j] - f[3 * j + 1] - (f[3 * j + 1] - f[3 * j + 2])); /* exact: they are close */
+}
+
+/* Four times the median: more than nearly all, whatever a kink of a ReLU has put into some. */
+static float disti_shape_noise(int count, float *bends)
+{
+    for (int i = 1; i < count; i++)
+        for (int j = i; j > 0 && disti_finite(bends[j]) && !(bends[j - 1] <= bends[j]); j--) {
+            float bend = bends[j];
+            bends[j] = bends[j - 1];
+            bends[j - 1] = bend;
+        }
+    return disti_finite(bends[count / 2]) ? DISTI_MIN(4.0f * bends[count / 2], 3e38f) : 0.0f;
+}
+
 /* Sampled |grad f| outside the surface: the 4/5 quantile near it, 31/32 beyond disti_far_from, at least 1. What matters
    is not the steepest spot but how far f exceeds the distance, which is its mean slope on the way; how.certified takes
    the largest all the same. Half of the 768 points are those of a fixed low-discrepancy sequence (the plastic number's)
    in the bounding sphere, half are these moved along their gradients to a place near the surface. Notes which layers
-   meet no dead unit there, and what 16 bits are off. */
+   meet no dead unit there, what 16 bits are off, and what rounding is. */
 static void disti_shape_slope(dist_shape *shape, const dist_field *field)
 {
     enum { ROUNDS = 16, BINS = 256 };
     int bins[2][BINS], count[2] = {0, 0};
     float most[2] = {1.0f, 1.0f};
     float points[3 * DISTI_BLOCK], sdf[DISTI_BLOCK], gradient[3 * DISTI_BLOCK], slopes[2];
+    float bends[ROUNDS / 4 * DISTI_BENDS];
     float beyond = disti_far_from(field);
     const dist_net *net = shape->net;
     disti_block b;
@@ -8385,7 +8423,9 @@ static void disti_shape_slope(dist_shape *shape, const dist_field *field)
             if (disti_finite(slope)) most[far] = DISTI_MAX(most[far], slope);
         }
         if (field->coarse_fn) shape->half_error = DISTI_MAX(shape->half_error, disti_coarse_apart(field, points, sdf));
+        if (round % 4 == 3) disti_shape_bends(field, points, bends + round / 4 * DISTI_BENDS);
     }
+    shape->noise = disti_shape_noise((int)ROUNDS / 4 * DISTI_BENDS, bends);
     for (int far = 0; far < 2; far++) {
         int above = 0, bin = BINS - 1;
         while (bin > 0 && above + bins[far][bin] <= count[far] / (far ? 32 : 5)) above += bins[far][bin--];
@@ -8462,6 +8502,7 @@ DIST_API dist_field dist_shape_field(dist_shape *shape)
     field.lipschitz_far = shape->lipschitz_far;
     field.certified = shape->certified;
     field.certified_far = shape->certified_far;
+    field.noise = shape->noise;
     field.clamp = net->clamp;
     field.cost = (float)dist_net_operations(net, 1);
     field.kinks = net->activation == DIST_ACTIVATION_RELU;
@@ -10077,7 +10118,7 @@ static float disti_paper_alpha(const dist_render_desc *how)
 static float disti_field_noise(const dist_field *field)
 {
     double c[3] = {(double)field->center[0], (double)field->center[1], (double)field->center[2]};
-    return 5e-7f * field->radius + (float)(1.2e-7 * sqrt(disti_dot(c, c)));
+    return DISTI_MAX(5e-7f * field->radius + (float)(1.2e-7 * sqrt(disti_dot(c, c))), field->noise);
 }
 
 static dist_status disti_tracer_init(disti_tracer *tracer, dist_context *ctx, const dist_field *field,
@@ -10912,14 +10953,15 @@ typedef struct disti_budget {
     int marching;
 } disti_budget;
 
-/* Where the cones' axes over a block of 8 x 8 pixels had the least f: distance from the camera, f (3e38: no sample). */
+/* Where the axes of the cones over 8 x 8 pixels had the least f: distance from the camera, f (3e38: no sample), and
+   how far outside the bounding sphere, which counts only where there was no other. */
 enum {
     DISTI_LEAST_BLOCK = 8,
     DISTI_LEAST_ROW = (int)DISTI_TILE / DISTI_LEAST_BLOCK,
     DISTI_LEASTS = DISTI_LEAST_ROW * DISTI_LEAST_ROW
 };
 typedef struct disti_least {
-    float t[DISTI_LEASTS], f[DISTI_LEASTS];
+    float t[DISTI_LEASTS], f[DISTI_LEASTS], out[DISTI_LEASTS];
 } disti_least;
 
 typedef struct disti_bench { /* the work bench of one task */
@@ -12521,7 +12563,7 @@ typedef struct disti_cone {
     float f;      /* last sample */
     float out;    /* how far outside the bounding sphere the axis is there */
     double least_t; /* where the block's axes had the least f, and that f */
-    float least_f;
+    float least_f, least_out;
 } disti_cone;
 
 enum {
@@ -12613,9 +12655,11 @@ static int disti_cone_advance(const disti_tracer *tracer, disti_cone *cone, floa
     if (!disti_finite(f) || ++cone->steps > 64) return DISTI_CONE_BLOCKED;
     /* on the plateau of a clamped field, where samples are equal, the one nearest to the center */
     int level = !(f > cone->least_f) && fabs(cone->t - cone->base) < fabs(cone->least_t - cone->base);
-    if ((f < cone->least_f || level) && !(cone->out > 0.0f)) {
+    int better = cone->out > 0.0f ? !(cone->least_f < 2e38f) : cone->least_out > 0.0f || f < cone->least_f || level;
+    if (better) {
         cone->least_f = f;
         cone->least_t = cone->t;
+        cone->least_out = cone->out;
     }
     float margin = tracer->epsilon > 0.0f ? tracer->epsilon : disti_default_epsilon(tracer);
     double radius = (double)disti_empty(tracer, f - margin), out = (double)cone->out, wide = cone->t * cone->sine;
@@ -12637,9 +12681,12 @@ static void disti_cone_finish(const disti_tracer *tracer, const disti_tile *tile
     for (int y = cone->y; y < DISTI_MIN(cone->y + cone->size, tile->own_height); y += DISTI_LEAST_BLOCK) {
         for (int x = cone->x; x < DISTI_MIN(cone->x + cone->size, tile->own_width); x += DISTI_LEAST_BLOCK) {
             int block = y / DISTI_LEAST_BLOCK * DISTI_LEAST_ROW + x / DISTI_LEAST_BLOCK;
-            if (!(cone->least_f < bench->least_of->f[block])) continue;
-            bench->least_of->f[block] = cone->least_f;
-            bench->least_of->t[block] = (float)cone->least_t;
+            disti_least *least = bench->least_of;
+            int out = cone->least_out > 0.0f, had = least->out[block] > 0.0f;
+            if (!(had && !out) && !(had == out && cone->least_f < least->f[block]) && least->f[block] < 2e38f) continue;
+            least->f[block] = cone->least_f;
+            least->t[block] = (float)cone->least_t;
+            least->out[block] = cone->least_out;
         }
     }
     float axis[3], p[3];
@@ -12673,6 +12720,7 @@ static void disti_cone_add(const disti_tracer *tracer, const disti_tile *tile, d
     cone->t = parent ? parent->t : 0.0;
     cone->least_t = parent ? parent->least_t : 0.0;
     cone->least_f = parent ? parent->least_f : 3e38f;
+    cone->least_out = parent ? parent->least_out : 0.0f;
     disti_cone_init(tracer, tile, bench, cone);
     if (cone->state == DISTI_CONE_MARCHES) bench->index[(*listed)++] = bench->cones;
     bench->cones++;
@@ -13190,7 +13238,7 @@ static void disti_minima_keep(const disti_minima *m, int index, float s, float f
         float t = m->bench->least_of->t[block];
         from.f = m->bench->least_of->f[block];
         from.s = (float)((double)t - ray->base);
-        aside = 1.5f * (float)DISTI_CONE_FIRST * ray->footprint * t;
+        aside = 1.5f * (float)DISTI_CONE_FIRST * ray->footprint * t + m->bench->least_of->out[block];
     }
     float step = fabsf(s - from.s) + aside, rise = disti_empty(tracer, from.f) + disti_empty(tracer, -f);
     rise = rise * tracer->lipschitz - 2.0f * tracer->noise;
@@ -13340,13 +13388,21 @@ static void disti_minima_fill(const disti_minima *m, const disti_corners *corner
     }
 }
 
+/* The block's least sample on an axis of its cones, at a distance of *t; 3e38: none. */
+static float disti_minima_least(const disti_minima *m, int block, float *t)
+{
+    const disti_least *least = m->bench->least_of;
+    *t = least->t[block];
+    return least->out[block] > 0.0f ? 3e38f : least->f[block];
+}
+
 /* A node amid four others: from f = enough on it takes what they say, else it asks there. */
 static size_t disti_minima_place(disti_minima *m, const disti_corners *corners, int x, int y, int h, float enough,
                                  size_t count)
 {
     int index = y * m->tile->width + x, block = y / DISTI_LEAST_BLOCK * DISTI_LEAST_ROW + x / DISTI_LEAST_BLOCK;
     disti_ray *ray = &m->bench->rays[index];
-    float t = m->bench->least_of->t[block], f = m->bench->least_of->f[block];
+    float t, f = disti_minima_least(m, block, &t);
     if (corners->agree > 0) disti_corners_at(corners, x, y, &t, &f);
     ray->b.f = corners->agree == 4 ? f : 0.0f; /* what is to be expected; beside hits nothing is */
     float s = f < 2e38f ? (float)((double)t - ray->base) : 0.0f;
@@ -13369,7 +13425,7 @@ static void disti_minima_first(disti_minima *m)
             for (int x = 0; x < w; x = disti_node_after(x, h, w)) {
                 int block = y / DISTI_LEAST_BLOCK * DISTI_LEAST_ROW + x / DISTI_LEAST_BLOCK;
                 disti_ray *ray = &m->bench->rays[y * w + x];
-                float t = m->bench->least_of->t[block], f = m->bench->least_of->f[block];
+                float t, f = disti_minima_least(m, block, &t);
                 if (!disti_wants_minimum(ray)) continue;
                 if (!again) {
                     count = disti_minima_list(m, y * w + x, f < 2e38f ? (float)((double)t - ray->base) : 0.0f, count);
@@ -15380,7 +15436,7 @@ static int disti_render_guarded(const disti_render_job *job, int worker, int ind
     int n = tile->width * tile->height, open = 1;
     unsigned long long kept = job->least ? budget->left / 4 : 0; /* for the smallest f of misses */
     budget->left -= kept;
-    for (int i = 0; i < DISTI_LEASTS; i++) bench->least_of->f[i] = 3e38f;
+    for (int i = 0; i < DISTI_LEASTS; i++) bench->least_of->f[i] = 3e38f, bench->least_of->out[i] = 0.0f;
     if (!tracer->how.no_cones)
         open = disti_cones(tracer, worker, tile, bench, job->lattice ? job->lattice : (int)DISTI_CONE_LEAF,
                            job->coned ? job->tape->cones + (size_t)index * (size_t)disti_tile_cones(job->tile) : NULL);

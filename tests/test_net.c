@@ -803,6 +803,107 @@ static double sphere_mean(dist_context *ctx, const dist_field *field, double r, 
     return mean;
 }
 
+/* A plain net of dist_net_create, in double. */
+static double plain_eval(const dist_net_desc *d, const float *weights, const double p[3])
+{
+    double x[64], y[64];
+    int in = 3;
+    memcpy(x, p, 3 * sizeof(double));
+    for (int l = 0; l <= d->layers; l++) {
+        int out = l == d->layers ? 1 : d->width;
+        const float *bias = weights + out * in;
+        for (int o = 0; o < out; o++) {
+            y[o] = (double)bias[o];
+            for (int k = 0; k < in; k++) y[o] += (double)weights[o * in + k] * x[k];
+            if (l == d->layers) continue;
+            if (d->activation == DIST_ACTIVATION_SOFTPLUS) y[o] = fmax(y[o], 0) + log1p(exp(-100 * fabs(y[o]))) / 100;
+            if (d->activation == DIST_ACTIVATION_RELU) y[o] = fmax(y[o], 0);
+            if (d->activation == DIST_ACTIVATION_SINE) y[o] = sin(5 * y[o]);
+            if (d->activation == DIST_ACTIVATION_TANH) y[o] = tanh(y[o]);
+        }
+        weights = bias + out;
+        in = out;
+        memcpy(x, y, sizeof x);
+    }
+    return x[0];
+}
+
+/* A small net rounds by the size of its hidden values, which is that of 1, not of its bound: field.noise says so, and
+   hits are as near as they say. (But for a few: where such an f is flat its noise goes a long way.) */
+TEST(a_small_net_says_how_it_rounds)
+{
+    enum { RAYS = 300 };
+    static const int activations[4] = {DIST_ACTIVATION_RELU, DIST_ACTIVATION_SOFTPLUS, DIST_ACTIVATION_SINE,
+                                       DIST_ACTIVATION_TANH};
+    static float from[3 * RAYS], to[3 * RAYS];
+    static dist_hit hits[RAYS];
+    dist_context *ctx = test_context();
+    test_random r = test_random_seed(31);
+    for (int k = 0; k < 16; k++) {
+        dist_net_desc d;
+        double bound = pow(10, -(k / 4)), worst = 0;
+        int found = 0, off = 0;
+        memset(&d, 0, sizeof d);
+        d.layers = 3;
+        d.width = 48;
+        d.activation = activations[k % 4];
+        d.geometric = k % 4 < 2;
+        d.scale = k % 4 == 1 ? 100 : k % 4 == 2 ? 5 : 0;
+        d.output_linear = 1;
+        d.seed = (unsigned)k + 1;
+        d.bound = (float)bound;
+        dist_net *net = dist_net_create(ctx, &d);
+        REQUIRE(net != NULL);
+        size_t count = dist_net_weight_count(net);
+        float *weights = (float *)malloc(count * sizeof(float));
+        REQUIRE(weights != NULL);
+        memcpy(weights, dist_net_weights(net), count * sizeof(float));
+        if (!d.geometric) { /* a surface through the middle */
+            const double middle[3] = {0.1 * bound, 0, 0};
+            weights[count - 1] -= (float)plain_eval(&d, weights, middle);
+            CHECK_STATUS(DIST_OK, dist_net_set_weights(ctx, net, weights), ctx);
+        }
+        dist_shape *shape = dist_shape_create(ctx, net, NULL);
+        REQUIRE(shape != NULL);
+        dist_field field = dist_shape_field(shape);
+        for (int i = 0; i < RAYS; i++) {
+            double p[3];
+            float q[3], f;
+            for (int j = 0; j < 3; j++) {
+                p[j] = (double)(q[j] = (float)(bound * test_random_double(&r, -0.6, 0.6)));
+                from[3 * i + j] = (float)(bound * test_random_double(&r, -1.5, 1.5));
+                to[3 * i + j] = (float)(bound * test_random_double(&r, -0.5, 0.5)) - from[3 * i + j];
+            }
+            CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &field, 1, q, &f, NULL), ctx);
+            worst = fmax(worst, fabs((double)f - plain_eval(&d, weights, p)));
+        }
+        CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, RAYS, from, to, NULL, hits, NULL), ctx);
+        for (int i = 0; i < RAYS; i++) {
+            double length = 0, f[2], e = 1.01 * (double)hits[i].error + 3e-7 * bound;
+            if (hits[i].status != DIST_RAY_HIT) continue;
+            for (int j = 0; j < 3; j++) length += (double)to[3 * i + j] * (double)to[3 * i + j];
+            for (int side = 0; side < 2; side++) {
+                double p[3], t = ((double)hits[i].distance + (side ? e : -e)) / sqrt(length);
+                for (int j = 0; j < 3; j++) p[j] = (double)from[3 * i + j] + t * (double)to[3 * i + j];
+                f[side] = plain_eval(&d, weights, p);
+            }
+            found++;
+            off += f[0] * f[1] > 0;
+        }
+        double figure = fmax(5e-7 * bound, (double)field.noise);
+        if (test_state.verbose)
+            printf("    bound %g, activation %d: f off by %.1e, figure %.1e; %d of %d hits beyond their error\n", bound,
+                   d.activation, worst, figure, off, found);
+        CHECK(worst < 2 * figure);
+        CHECK(figure < 30 * worst + 6e-7 * bound);
+        CHECK(found > 60 && off * 25 <= found);
+        free(weights);
+        dist_shape_destroy(shape);
+        dist_net_destroy(net);
+    }
+    dist_context_destroy(ctx);
+}
+
 TEST(a_geometric_start_is_near_the_distance_to_a_sphere_of_half_the_bound)
 {
     static const struct start {
@@ -1700,6 +1801,7 @@ int main(int argc, char **argv)
     RUN(saving_into_too_small_a_buffer_is_refused);
     RUN(a_file_that_takes_nothing_is_told_of);
     RUN(a_net_saved_to_a_file_is_loaded_from_it);
+    RUN(a_small_net_says_how_it_rounds);
     RUN(a_geometric_start_is_near_the_distance_to_a_sphere_of_half_the_bound);
     RUN(a_seed_gives_the_same_net_and_another_seed_another);
     RUN(a_net_made_has_the_form_asked_for);

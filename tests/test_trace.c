@@ -315,7 +315,7 @@ TEST(one_pixel_in_5000_of_a_rod_is_missed_by_large_pictures_and_none_certified)
     test_shape shape = shape_make(SHAPE_RODS, 1e-3, 0, 0, 0);
     dist_field field = shape_field(&shape, 1, 1);
     test_random r = test_random_seed(17);
-    int crossing = 0, missed[2] = {0, 0};
+    int crossing = 0, missed[2] = {0, 0}, phantom[2] = {0, 0};
     for (int k = 0; k < (test_quick() ? 4 : 8); k++) {
         float eye[3];
         test_random_direction(&r, eye);
@@ -326,16 +326,20 @@ TEST(one_pixel_in_5000_of_a_rod_is_missed_by_large_pictures_and_none_certified)
             how.certified = certified;
             CHECK_STATUS(DIST_OK, picture_render(ctx, &field, &camera, &how, &picture_a), ctx);
             verdict v = judge(&shape, &camera, 1, 1, 1e-5, &picture_a);
-            CHECK(v.spent == 0 && v.phantom == 0);
+            CHECK_EQUAL(0, v.spent);
             crossing += certified ? 0 : v.crossing;
             missed[certified] += v.missed;
+            phantom[certified] += v.phantom; /* beside a rod by more than 1.5 epsilon, hundredths of a pixel */
         }
     }
     if (test_state.verbose)
-        printf("    of %d pixels of rods %d are missed, certified %d\n", crossing, missed[0], missed[1]);
+        printf("    of %d pixels of rods %d are missed, certified %d; seen beside them %d and %d\n", crossing, missed[0],
+               missed[1], phantom[0], phantom[1]);
     CHECK(crossing > 500);
-    CHECK(missed[0] * 5000 <= crossing);
+    CHECK(missed[0] * 5000 < crossing + 5000); /* rounded up */
+    CHECK(phantom[0] * 5000 < crossing + 5000);
     CHECK_EQUAL(0, missed[1]);
+    CHECK_EQUAL(0, phantom[1]);
     dist_context_destroy(ctx);
 }
 
@@ -1754,16 +1758,17 @@ TEST(a_solid_that_only_the_silhouette_finds_is_no_miss)
                 square += (double)origin[j] * (double)origin[j];
             }
             double aside = square - along * along, truth = along - sqrt(fmax(0.36 - aside, 0.0));
-            missed += picture_a.status[i] == DIST_RAY_MISS && aside < 0.35;
+            missed += picture_a.status[i] == DIST_RAY_MISS && aside < 0.35; /* fewer than half */
             if (picture_a.status[i] != DIST_RAY_UNRESOLVED) continue;
             found++;
             CHECK(aside < 0.36);
             CHECK_NEAR(truth, picture_a.distance[i], (double)picture_a.error[i] + 1e-5);
         }
-        CHECK(found > 100);
+        CHECK(found > 100 && missed < 2000);
         CHECK(picture_a.stats.unresolved == (unsigned long long)found);
-        CHECK(picture_a.stats.steepest > 1.5f && picture_a.stats.steepest < 1.001f * (float)k);
-        if (test_state.verbose) printf("    slope %d: %d found, %d missed\n", k, found, missed);
+        CHECK(picture_a.stats.steepest > 2.0f && picture_a.stats.steepest < 1.001f * (float)k);
+        if (test_state.verbose)
+            printf("    slope %d: %d found, %d missed, met %.2f\n", k, found, missed, (double)picture_a.stats.steepest);
     }
     test_shape all = shape_make(SHAPE_SPHERE, 1.4, 0, 0, 0); /* but a ray within a solid that has no end does miss it */
     dist_field field = shape_field(&all, 1, 1);

@@ -96,9 +96,9 @@ DIST_API const char *dist_version(void);
 /* Memory. alloc_fn returns `bytes` bytes aligned to `alignment` (a power of two, at most 64) or NULL; free_fn gets the
    same pointer and size back, never NULL. Called by create, load, save and destroy functions, those that make meshes
    or measure them, dist_shape_set_texture, dist_net_set_half and, for a field of your own or an analytic one, by the
-   first call that wants the gradient of its code or color (dist_render_backward: of more than 992 numbers); by no
-   other. Like every hook, it may use this library with other contexts than the one that calls it.
-   Either both functions or none; none: malloc and free. */
+   first call but dist_render_backward that wants the gradient of its code or color; by no other. Like every hook, it
+   may use this library with other contexts than the one that calls it. Either both functions or none; none: malloc and
+   free. */
 typedef struct dist_allocator {
     void *user;
     void *(*alloc_fn)(void *user, size_t bytes, size_t alignment);
@@ -394,7 +394,8 @@ enum {
 };
 
 /* Reads a model in safetensors form; tensor names and metadata as the README's "Model files" says. The bytes are
-   copied. A file is hostile until proved otherwise: NULL and a sentence for anything that does not fit. */
+   copied. A file is hostile until proved otherwise: NULL and a sentence for anything that does not fit. Takes twice a
+   file in F32, four times one in 16 bits, and up to 32 bytes more for each input of a layer; no more on the way. */
 DIST_API dist_net *dist_net_load(dist_context *ctx, const void *bytes, size_t size);
 #ifndef DIST_NO_STDIO
 /* A file of at most 2 GB; a sentence about it ends with its path. */
@@ -416,9 +417,9 @@ enum {
    made afterwards have field.coarse_fn, and as field.coarse_error the largest difference to f32 met at 768 points of
    the bounding sphere when the shape is made: a sample, not a proof. The point's columns and the last layer stay in
    f32; a block in which anything overflows is evaluated in f32. DIST_UNSUPPORTED: a processor or build without these
-   instructions, LayerNorm, weights beyond 65504 in F16 (set later, they turn it off); then, and on contexts of another
-   isa than DIST_ISA_AVX512, coarse_fn is NULL: dist_context_clear, where f32 will do. No shape of the net may be in
-   use by another thread. */
+   instructions, LayerNorm, weights beyond 65504 in F16 (set later, they turn it off); then what was in force stays, at
+   first nothing. Without, and on contexts of another isa than DIST_ISA_AVX512, coarse_fn is NULL: dist_context_clear,
+   where f32 will do. No shape of the net may be in use by another thread. */
 DIST_API dist_status dist_net_set_half(dist_context *ctx, dist_net *net, int kind);
 /* What is in force: DIST_HALF_OFF, F16 or BF16. */
 DIST_API int dist_net_half(const dist_net *net);
@@ -624,11 +625,12 @@ typedef struct dist_hit {
     int status;     /* DIST_RAY_* */
 } dist_hit; /* DIST_RAY_NOT_FINITE: distance, error and sdf say nothing */
 
-/* Traces n rays (origins (n, 3), directions (n, 3) of any length from 1.2e-38 on) with the guarded tracer: picking,
-   shadows, visibility. The first surface in front of each origin; with how.any_hit any of them. A ray that is 0 or not
-   finite is DIST_RAY_NOT_FINITE. No cone and no neighbor helps a free ray to see what is thin: with how.certified it
-   asks more, and steps over nothing as far as the Lipschitz figures are bounds. A hit is as often just inside as just
-   outside: a shadow ray sets out a little along the normal, some thousandths of the radius. stats may be NULL. */
+/* Traces n rays (origins (n, 3), directions (n, 3) of any length; numbers below 1.2e-38 are 0) with the guarded tracer:
+   picking, shadows, visibility. The first surface in front of each origin; with how.any_hit any of them. A ray that is
+   0 or not finite is DIST_RAY_NOT_FINITE. No cone and no neighbor helps a free ray to see what is thin: with
+   how.certified it asks more, and steps over nothing as far as the Lipschitz figures are bounds. A hit is as often just
+   inside as just outside: a shadow ray sets out a little along the normal, some thousandths of the radius. stats may be
+   NULL. */
 DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size_t n, const float *origins,
                                 const float *directions, const dist_render_desc *how, dist_hit *hits,
                                 dist_stats *stats);
@@ -636,15 +638,15 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
 /* The nearest point of the surface to each of n points: steps along the gradient onto the surface, then along the
    surface as long as that brings it nearer, then a look around, through the cells of an octree (16 along each side of
    the cube around the bounding sphere) that the figures for how.certified do not show to be empty. Of a distance it is
-   as far off as the nearest to within 1e-4 of the radius, but for one in a thousand of the points beyond the sphere
-   where parts are small (by a hundredth); of a trained decoder mostly to within a 500th, from far away, too: two parts
-   of the surface in one cell may be taken for one. Of a field clamped below a tenth of its radius the cells tell
+   as far off as the nearest to within 1e-4 of the radius, but for one to six in a thousand of the points beyond the
+   sphere where parts are small (by up to .014); of a trained decoder mostly to within a 500th, from far away, too: two
+   parts of the surface in one cell may be taken for one. Of a field clamped below a tenth of its radius the cells tell
    little: a part that is not the nearest, or none, may be what is found. Inside the sphere a distance is asked for 2
    samples a point, mostly; a decoder from far away for 40 to 120 a point of some hundred in one call, which share the
    cells, and for 200 to 2000 of a point alone. A cache spares the cells that it shows to be empty. Of a scene each
-   instance that may be nearest is gone to by itself; what is of one within another is no surface.
-   closest (n, 3); distance (n) signed, below 0 inside, and status (n) may be NULL: DIST_RAY_HIT, DIST_RAY_UNRESOLVED
-   (no surface found: the last point tried), DIST_RAY_NOT_FINITE. Nothing is asked outside the bounding sphere. */
+   instance that may be nearest is gone to by itself; what is of one within another is no surface. closest (n, 3);
+   distance (n) signed, below 0 inside, and status (n) may be NULL: DIST_RAY_HIT, DIST_RAY_UNRESOLVED (no surface found:
+   the last point tried), DIST_RAY_NOT_FINITE. Nothing is asked outside the bounding sphere. */
 DIST_API dist_status dist_field_closest_point(dist_context *ctx, const dist_field *field, size_t n,
                                               const float *points, float *closest, float *distance,
                                               unsigned char *status);
@@ -661,10 +663,10 @@ typedef struct dist_cache dist_cache;
 DIST_API dist_cache *dist_cache_create(dist_context *ctx, const dist_field *field, int resolution);
 DIST_API void dist_cache_destroy(dist_cache *cache);
 /* The field with its cache, to be traced instead of it. Borrows both. As soon as the shape's code, the net's weights or
-   the scene have changed every call refuses it, nearest points and contacts of a scene with such an instance, too; a
-   field of your own without changes_fn must not change. A cache serves
-   Lipschitz figures up to those it was made with: raise field.lipschitz, lipschitz_far before, not how.lipschitz. With
-   how.certified it is used only where it was made with figures as large as field.certified and certified_far. */
+   the scene have changed every call that asks for distances refuses it, nearest points and contacts of a scene with
+   such an instance, too; a field of your own without changes_fn must not change. A cache serves Lipschitz figures up to
+   those it was made with: raise field.lipschitz, lipschitz_far before, not how.lipschitz. With how.certified it is used
+   only where it was made with figures as large as field.certified and certified_far. */
 DIST_API dist_field dist_cache_field(const dist_cache *cache);
 /* Makes it anew for a field that has changed, or another one; then take dist_cache_field again. No allocator call. */
 DIST_API dist_status dist_cache_update(dist_cache *cache, const dist_field *field);
@@ -835,7 +837,7 @@ DIST_API size_t dist_adam_step(dist_adam *adam, size_t n, float *x, const float 
 /* Triangles, counterclockwise seen from outside. Made by the functions below, ended by dist_mesh_destroy. */
 typedef struct dist_mesh {
     float *vertices;     /* (vertex_count, 3) */
-    float *normals;      /* (vertex_count, 3), unit, outward; NULL if not asked for */
+    float *normals;      /* (vertex_count, 3), unit, outward, 0 where grad f is; NULL if not asked for */
     unsigned *triangles; /* (triangle_count, 3) */
     size_t vertex_count;
     size_t triangle_count;
@@ -8777,9 +8779,10 @@ static dist_status disti_net_arrange(dist_context *ctx, dist_net *net, const int
         layer->point = sees_input ? net->point_size : 0;
         layer->code = sees_input ? net->code_size : 0;
         layer->scale = l > 0 && skip[l] ? skip_scale : 1.0f;
+        const char digits[3] = {(char)('0' + (l < 10 ? l : l / 10)), (char)(l < 10 ? 0 : '0' + l % 10), 0};
         if (layer->in != layer->prev + (sees_input ? input : 0))
             return disti_fail(ctx, DIST_BAD_FILE,
-                              "dist_net_load: a layer is %d wide at its input, but what feeds it has %d", NULL,
+                              "dist_net_load: layer %s is %d wide at its input, but what feeds it has %d", digits,
                               layer->in, layer->prev + (sees_input ? input : 0));
         int at = layer->prev > 0 && !net->skip_input_first ? layer->prev : 0;
         layer->x_column = at > 0 || !sees_input ? 0 : input;
@@ -9149,10 +9152,10 @@ static dist_status disti_loader_meta(disti_loader *loader)
     loader->skip_scale = (float)disti_loader_number(loader, "dist.skip_scale", 1e-6, 1e6, 1);
     if (loader->status == DIST_OK && encoding != (levels > 0))
         disti_loader_fail(loader, DIST_BAD_FILE,
-                          encoding ? "dist_net_load: metadata dist.encoding is %s, so its levels must be 1 to 16"
+                          encoding ? "dist_net_load: metadata dist.encoding is %s, so its levels are 1 to 16, not %d"
                                    : "dist_net_load: metadata dist.encoding.levels is %s, which only fourier has",
-                          disti_archive_meta(&loader->archive, encoding ? "dist.encoding" : "dist.encoding.levels"), 0,
-                          0);
+                          disti_archive_meta(&loader->archive, encoding ? "dist.encoding" : "dist.encoding.levels"),
+                          (double)levels, 0);
     return loader->status;
 }
 
@@ -9196,30 +9199,48 @@ static dist_status disti_loader_norms(disti_loader *loader)
     return loader->status;
 }
 
-/* What a layer has that is not understood, or twice, must not be left out without a word. */
+/* Where the name of a tensor goes on behind "prefix" "stem" K: *k. NULL: it is no such name, or K begins with 0. */
+static const char *disti_loader_ending(const disti_loader *loader, const char *name, const char *stem, int *k)
+{
+    size_t prefix = strlen(loader->prefix), length = strlen(stem);
+    if (strncmp(name, loader->prefix, prefix) != 0 || strncmp(name + prefix, stem, length) != 0) return NULL;
+    const char *c = name + prefix + length, *digits = c;
+    for (*k = 0; *c >= '0' && *c <= '9'; c++) *k = *k < 1000 ? 10 * *k + (*c - '0') : *k;
+    return c == digits ? NULL : *digits == '0' && c > digits + 1 ? "" : c;
+}
+
+/* What a layer has that is not understood, or twice, must not be left out without a word; nor a normalization, unless
+   the metadata say that there is none. */
 static dist_status disti_loader_strangers(disti_loader *loader)
 {
     static const char known[6][36] = {".weight", ".bias", ".weight_g", ".weight_v",
                                       ".parametrizations.weight.original0", ".parametrizations.weight.original1"};
-    size_t prefix = strlen(loader->prefix);
+    int told = disti_archive_meta(&loader->archive, "dist.norm") != NULL, last = loader->net->layers - 1, k;
     for (size_t i = 0; i < loader->archive.tensor_count; i++) {
-        const char *name = loader->archive.tensors[i].name, *ending;
+        const char *name = loader->archive.tensors[i].name, *ending = disti_loader_ending(loader, name, "lin", &k);
         int found = 0;
-        if (strncmp(name, loader->prefix, prefix) != 0 || strncmp(name + prefix, "lin", 3) != 0) continue;
-        ending = name + prefix + 3;
-        if (*ending < '0' || *ending > '9') continue;
-        while (*ending >= '0' && *ending <= '9') ending++;
-        for (int k = 0; k < 6; k++) found |= strcmp(ending, known[k]) == 0;
-        if (!found)
+        for (int j = 0; j < 6 && ending; j++) found |= strcmp(ending, known[j]) == 0;
+        if (ending && !found)
             return disti_loader_fail(loader, DIST_UNSUPPORTED, "dist_net_load: tensor %s is of a layer, which has "
                                      ".weight, or a weight-norm pair, and .bias", name, 0, 0);
+        ending = disti_loader_ending(loader, name, "norm", &k);
+        if (!ending) ending = disti_loader_ending(loader, name, "bn", &k);
+        if (!ending || (told && !loader->net->normed)) continue;
+        if (k >= last || !loader->net->normed || (strcmp(ending, known[0]) != 0 && strcmp(ending, known[1]) != 0))
+            return disti_loader_fail(loader, DIST_UNSUPPORTED, "dist_net_load: tensor %s is of a normalization, which "
+                                     "layers but the last have, .weight and .bias", name, 0, 0);
     }
-    for (int k = 0; k < loader->net->layers; k++)
+    for (k = 0; k <= last; k++) {
         if ((disti_loader_find(loader, "lin", k, known[0]) != NULL) +
                 (disti_loader_find(loader, "lin", k, known[2]) != NULL) +
                 (disti_loader_find(loader, "lin", k, known[4]) != NULL) > 1)
             return disti_loader_fail(loader, DIST_BAD_FILE, "dist_net_load: layer %d has its weights twice", NULL, k,
                                      0);
+        if (loader->net->normed && disti_loader_find(loader, "norm", k, known[0]) &&
+            disti_loader_find(loader, "bn", k, known[0]))
+            return disti_loader_fail(loader, DIST_BAD_FILE, "dist_net_load: layer %d has its normalization twice", NULL,
+                                     k, 0);
+    }
     return loader->status;
 }
 
@@ -11463,7 +11484,9 @@ static void disti_free_task(void *arg, int index, int worker)
         disti_ray *ray = &bench.rays[i];
         disti_ray_init(job->tracer->field, o, d, 0.0, ray);
         if (end > 0.0 && end - ray->base < (double)ray->leave) {
+            int starts = !(ray->enter > (float)-ray->base); /* in the sphere; whether in the solid is asked anyway */
             ray->leave = DISTI_MAX(ray->enter, (float)(end - ray->base));
+            if (ray->leave <= ray->enter && starts) ray->leave = ray->enter + 1.2e-7f * job->tracer->field->radius;
             if (ray->leave <= ray->enter) ray->mode = DISTI_DONE;
         }
         if (!good) disti_ray_end(&bench.rays[i], DIST_RAY_NOT_FINITE, 0.0f, 0.0f, 0.0f);
@@ -16147,6 +16170,7 @@ DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *ta
     if (status != DIST_OK) return status;
     memset(&job, 0, sizeof job);
     size_t size = (size_t)tape->field.code_size + (size_t)tape->field.color_code_size, room = ctx->partial_size - 1;
+    if (!grads->code && !d_out->color) size = 0; /* no code's gradient is summed */
     if (size + size / DISTI_SLOTS > room) /* see disti_partial_for */
         return disti_fail(ctx, DIST_UNSUPPORTED, "%s: the field's codes have %d numbers, at most %d here", name,
                           (double)size, (double)(room - room / (DISTI_SLOTS + 1)));
@@ -16646,7 +16670,8 @@ static int disti_mesh_add_vertex(dist_mesh *mesh, const float p[3])
     if (!grown) return 0;
     mesh->vertices = grown;
     if (mesh->vertex_count >= 0xfffffffeu) {
-        disti_fail(mesh->owner, DIST_UNSUPPORTED, "mesh: more than 4294967294 vertices", NULL, 0, 0);
+        disti_fail(mesh->owner, DIST_UNSUPPORTED, "%s: more than 4294967294 vertices", mesh->owner->function, 0,
+                   0);
         return 0;
     }
     memcpy(mesh->vertices + 3 * mesh->vertex_count++, p, 3 * sizeof(float));
@@ -17747,6 +17772,11 @@ static int disti_off_number(disti_mesh_text *r, double *out)
     return disti_mesh_fail(r, DIST_BAD_FILE, "truncated, or not a number", 0);
 }
 
+static int disti_off_line_ends(const disti_text *t)
+{
+    return t->at >= t->end || *t->at == '#' || disti_is_line_end(*t->at);
+}
+
 /* 0 after disti_fail where a count in the file is none. */
 static int disti_mesh_read_count(disti_mesh_text *r, double count)
 {
@@ -17754,7 +17784,7 @@ static int disti_mesh_read_count(disti_mesh_text *r, double count)
     return disti_mesh_fail(r, DIST_BAD_FILE, "%d is no count, must be a whole number from 0 to 4294967295", count);
 }
 
-/* What follows the numbers on a line (normals, colors) is left out. */
+/* What follows the numbers on a line (normals, colors) is left out. The number of edges may be missing. */
 static int disti_read_off(disti_mesh_text *r)
 {
     double counts[2], v[3], corners, index;
@@ -17763,7 +17793,15 @@ static int disti_read_off(disti_mesh_text *r)
         return disti_mesh_fail(r, DIST_UNSUPPORTED, "binary OFF is not supported", 0);
     for (int i = 0; i < 2; i++)
         if (!disti_off_number(r, counts + i) || !disti_mesh_read_count(r, counts[i])) return 0;
+    disti_skip_blank(&r->text);
+    int ends = disti_off_line_ends(&r->text);
     disti_skip_line(&r->text);
+    if (ends && counts[0] > 0.0) { /* is the number of edges by itself on the next line? */
+        disti_text next = r->text;
+        if (!disti_off_number(r, v)) return 0;
+        disti_skip_blank(&r->text);
+        if (!disti_off_line_ends(&r->text)) r->text = next;
+    }
     for (double i = 0.0; i < counts[0]; i += 1.0) {
         for (int k = 0; k < 3; k++)
             if (!disti_off_number(r, v + k)) return 0;

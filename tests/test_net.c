@@ -1301,6 +1301,22 @@ TEST(layer_norm_that_only_its_tensors_tell_of_is_not_left_out)
     REFUSED(DIST_BAD_FILE, "norm weight of layer 0 is missing", "", some);
     REFUSED(DIST_UNSUPPORTED, "bn0.running_mean is of a batch normalization", "",
             "lin0.weight 4 5;lin0.bias 4;bn0.weight 4;bn0.bias 4;bn0.running_mean 4;lin1.weight 1 4;lin1.bias 1;");
+    static const char whole[] = "lin0.weight 4 5;lin0.bias 4;norm0.weight 4;norm0.bias 4;lin1.weight 1 4;lin1.bias 1;";
+    static const char *const more[5][2] = {{"norm1.weight 1;norm1.bias 1;", "norm1.weight is of a normalization"},
+                                           {"norm0.gain 4;", "norm0.gain is of a normalization"},
+                                           {"norm00.weight 4;", "norm00.weight is of a normalization"},
+                                           {"bn2.bias 4;", "bn2.bias is of a normalization"},
+                                           {"lin01.weight 4 4;", "lin01.weight is of a layer"}};
+    for (int k = 0; k < 5; k++) {
+        char tensors[256];
+        sprintf(tensors, "%s%s", whole, more[k][0]);
+        REFUSED(DIST_UNSUPPORTED, more[k][1], "", tensors);
+    }
+    REFUSED(DIST_BAD_FILE, "layer 0 has its normalization twice", "",
+            "lin0.weight 4 5;lin0.bias 4;norm0.weight 4;norm0.bias 4;bn0.weight 4;bn0.bias 4;lin1.weight 1 4;"
+            "lin1.bias 1;");
+    REFUSED(DIST_UNSUPPORTED, "norm0.bias is of a normalization", "",
+            "lin0.weight 4 5;lin0.bias 4;norm0.bias 4;lin1.weight 1 4;lin1.bias 1;");
 }
 
 TEST(tensors_that_do_not_fit_are_refused_with_a_sentence)
@@ -1309,7 +1325,7 @@ TEST(tensors_that_do_not_fit_are_refused_with_a_sentence)
     REFUSED(DIST_BAD_FILE, "bias", "", "lin0.weight 4 5;lin1.weight 1 4;lin1.bias 1;");
     REFUSED(DIST_BAD_FILE, "lin0.bias has 3 numbers, must have 4", "",
             "lin0.weight 4 5;lin0.bias 3;lin1.weight 1 4;lin1.bias 1;");
-    REFUSED(DIST_BAD_FILE, "6 wide", "", "lin0.weight 4 5;lin0.bias 4;lin1.weight 1 6;lin1.bias 1;");
+    REFUSED(DIST_BAD_FILE, "layer 1 is 6 wide at its input, but what feeds it has 4", "", "lin0.weight 4 5;lin0.bias 4;lin1.weight 1 6;lin1.bias 1;");
     REFUSED(DIST_BAD_FILE, "(out, in)", "", "lin0.weight 20;lin0.bias 4;");
     REFUSED(DIST_BAD_FILE, "no tensor is called lin0.weight", "", "layer.weight 4 5;");
     REFUSED(DIST_BAD_FILE, "lin", "", "lin0.weight 4 2;lin0.bias 4;lin1.weight 1 4;lin1.bias 1;");

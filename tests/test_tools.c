@@ -97,6 +97,28 @@ TEST(a_ray_looks_as_far_as_it_is_told_in_lengths_of_its_direction)
     dist_context_destroy(ctx);
 }
 
+/* However short it looks: a ray that begins in the solid says so. */
+TEST(a_ray_that_looks_nowhere_knows_where_it_is)
+{
+    float ball[4] = {0.2f, 0, 0, 0.5f}, in[3] = {0.3f, 0.2f, 0.1f}, out[3] = {-0.35f, 0.1f, 0}, ahead[3] = {1, 0, 0};
+    dist_context *ctx = shape_context();
+    dist_field field = dist_field_sphere(ball);
+    field.radius = 1;
+    for (int i = 0; i < 30; i++) {
+        dist_render_desc how;
+        dist_hit hit;
+        memset(&how, 0, sizeof how);
+        how.max_distance = (float)pow(10, -i);
+        for (how.any_hit = 0; how.any_hit < 2; how.any_hit++) {
+            CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, 1, in, ahead, &how, &hit, NULL), ctx);
+            CHECK_EQUAL(DIST_RAY_INSIDE, hit.status);
+            CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, 1, out, ahead, &how, &hit, NULL), ctx);
+            CHECK_EQUAL(i == 0 ? DIST_RAY_HIT : i == 1 ? hit.status : DIST_RAY_MISS, hit.status);
+        }
+    }
+    dist_context_destroy(ctx);
+}
+
 TEST(any_hit_and_max_distance_are_refused_where_they_mean_nothing)
 {
     dist_context *ctx = shape_context();
@@ -1300,6 +1322,7 @@ int main(int argc, char **argv)
     test_begin(argc, argv);
     RUN(any_hit_finds_a_blocker_where_there_is_one_for_fewer_queries);
     RUN(a_ray_looks_as_far_as_it_is_told_in_lengths_of_its_direction);
+    RUN(a_ray_that_looks_nowhere_knows_where_it_is);
     RUN(any_hit_and_max_distance_are_refused_where_they_mean_nothing);
     RUN(closest_points_of_distances_are_exact);
     RUN(what_is_far_away_finds_its_nearest_point_and_what_it_touches);

@@ -333,8 +333,8 @@ TEST(one_pixel_in_5000_of_a_rod_is_missed_by_large_pictures_and_none_certified)
         }
     }
     if (test_state.verbose)
-        printf("    of %d pixels of rods %d are missed, certified %d; seen beside them %d and %d\n", crossing, missed[0],
-               missed[1], phantom[0], phantom[1]);
+        printf("    of %d pixels of rods %d and, certified, %d are missed; %d and %d are seen beside them\n", crossing,
+               missed[0], missed[1], phantom[0], phantom[1]);
     CHECK(crossing > 500);
     CHECK(missed[0] * 5000 < crossing + 5000); /* rounded up */
     CHECK(phantom[0] * 5000 < crossing + 5000);

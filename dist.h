@@ -748,10 +748,11 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
 #ifndef DIST_NO_BACKWARD
 /* Adjoint of the dist_render that filled the tape: reads d_out's depth, distance, normal, color, and silhouette if that
    was rendered; adds to grads; with how.relax_band color also at misses: outlines move, though not those that lie
-   before another surface. Of DIST_RAY_INSIDE only the silhouette counts, also where how.inside makes a hit of it; a
-   silhouette beside the bounding sphere is the camera's alone, not a scene's placements'. The least |f| of a ReLU net
-   lies at a kink: the silhouette's gradient is that of one side; at a hit it is that of f there. What is not finite in
-   d_out counts as 0. d_out->stats, if given, gets capped, backward_points and skipped added. No allocator call. */
+   before another surface. Of DIST_RAY_INSIDE only the silhouette counts, |f| where the ray starts, also where
+   how.inside makes a hit of it; a silhouette beside the bounding sphere is the camera's alone, not a scene's
+   placements'. The least |f| of a ReLU net lies at a kink: the silhouette's gradient is that of one side; at a hit it
+   is that of f there. What is not finite in d_out counts as 0. d_out->stats, if given, gets capped, backward_points and
+   skipped added. No allocator call. */
 DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *tape, const dist_images *d_out,
                                           const dist_gradients *grads);
 #endif
@@ -13945,6 +13946,7 @@ typedef struct disti_entry {
     float direction[3]; /* of the ray, field space */
     float weight;       /* of d_distance and d_depth: |n . v| in the normal mode, 1 else */
     unsigned char capped;
+    unsigned char edge; /* 1: where the ray enters or leaves the bounding sphere, and moves with it */
 } disti_entry;
 
 /* distance and status: written by dist_render, read by the backward pass. samples: the paper's K (f and point),
@@ -15726,6 +15728,9 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
               |f| > 0.1: the seed alpha d_t at each p_k. The residual e of eq. (4) is dropped, and K samples are
               summed, not averaged: the paper's approximation, in the scale of its authors' code.      (paper, 3.4)
    silhouette S = f(p_min) - epsilon: the seed d_S at the sample of smallest |f|                    (envelope theorem)
+              Where that is an end of the ray's part of the bounding sphere, with normal n there, the end slides along
+              the ray as the camera moves: of dp the sphere leaves dp - v (n . dp) / (n . v), so for the camera
+              y = d_S (g - n (g . v) / (n . v)); |n . v| counts as at least tau.
               no hit, yet f(p_min) < 0, as where the ray starts in the solid: S = -f(p_min) - epsilon, so the seed -d_S.
               off the sphere S = |o| - radius with o the ray's point nearest to it: y = d_S o / |o|.
    normal's   n = G / |G|: u = (d_n - n (n . d_n)) / |G| pulls on G, and s = u . G with u held has the rest: the field
@@ -15875,6 +15880,21 @@ static void disti_backward_sort(disti_render_backward_job *job)
     disti_run(job->ctx, (count + DISTI_PIECE - 1) / DISTI_PIECE, disti_backward_sort_task, job);
 }
 
+/* dL/dpoint of a point that stays on the bounding sphere. */
+static void disti_backward_edge(const dist_tape *tape, const float *p, const float v[3], float *d_point)
+{
+    double n[3], along = 0.0, across = 0.0;
+    for (int i = 0; i < 3; i++) n[i] = (double)p[i] - (double)tape->field.center[i];
+    if (!disti_normalize(n) || !disti_finite_all(3, d_point)) return;
+    for (int i = 0; i < 3; i++) {
+        along += (double)d_point[i] * (double)v[i];
+        across += n[i] * (double)v[i];
+    }
+    double least = (double)tape->tracer.how.gradient_cap;
+    if (fabs(across) < least) across = across < 0.0 ? -least : least;
+    for (int i = 0; i < 3; i++) d_point[i] = disti_within_float((double)d_point[i] - n[i] * along / across);
+}
+
 /* Runs the adjoint over the entries gathered so far. */
 static void disti_backward_flush(disti_render_backward_job *job)
 {
@@ -15891,6 +15911,7 @@ static void disti_backward_flush(disti_render_backward_job *job)
     for (size_t i = 0; i < job->count; i++) {
         const disti_entry *entry = &tape->entry[i];
         job->capped += entry->capped;
+        if (entry->edge) disti_backward_edge(tape, tape->points + 3 * i, entry->direction, tape->d_points + 3 * i);
         if (job->camera)
             disti_backward_hit(job, tape->points + 3 * i, tape->d_points + 3 * i, entry->direction,
                                entry->weight * entry->d_depth);
@@ -15900,7 +15921,7 @@ static void disti_backward_flush(disti_render_backward_job *job)
 }
 
 static void disti_backward_add(disti_render_backward_job *job, const disti_ray *ray, const float *point,
-                               float d_distance, float d_motion, float d_depth, float d_sdf)
+                               float d_distance, float d_motion, float d_depth, float d_sdf, int edge)
 {
     const dist_tape *tape = job->tape;
     disti_entry *entry = &tape->entry[job->count];
@@ -15908,6 +15929,7 @@ static void disti_backward_add(disti_render_backward_job *job, const disti_ray *
     entry->d_motion = d_motion;
     entry->d_depth = d_depth;
     entry->d_sdf = d_sdf;
+    entry->edge = (unsigned char)edge;
     memcpy(entry->direction, ray->direction, sizeof entry->direction);
     memcpy(tape->points + 3 * job->count, point, 3 * sizeof(float));
     if (++job->count == DISTI_CHUNK) disti_backward_flush(job);
@@ -15958,14 +15980,17 @@ static void disti_backward_pixel(disti_render_backward_job *job, size_t pixel, f
             float f = samples[4 * k], seed = k == 0 ? d_silhouette : 0.0f;
             int inside_clamp = (f < 0.0f ? -f : f) <= 0.1f * field->radius;
             if (paper && inside_clamp) seed += disti_paper_alpha(&tracer->how) * d_distance;
-            if (seed != 0.0f) disti_backward_add(job, &ray, samples + 4 * k + 1, 0.0f, 0.0f, 0.0f, seed);
+            if (seed != 0.0f) disti_backward_add(job, &ray, samples + 4 * k + 1, 0.0f, 0.0f, 0.0f, seed, 0);
         }
         if (!paper && (d_distance != 0.0f || d_motion != 0.0f))
-            disti_backward_add(job, &ray, p, d_distance, d_motion, d_depth, 0.0f);
+            disti_backward_add(job, &ray, p, d_distance, d_motion, d_depth, 0.0f, 0);
         return;
     }
+    float s = tape->s[pixel], near = 2e-6f * field->radius; /* how exactly ends are known */
+    int edge = s >= ray.leave - near || (s <= ray.enter + near && ray.enter > (float)-ray.base + near);
+    edge &= !(status & DISTI_TAPE_HIT);
     if (d_distance != 0.0f || d_motion != 0.0f || d_silhouette != 0.0f)
-        disti_backward_add(job, &ray, p, d_distance, d_motion, d_depth, d_silhouette);
+        disti_backward_add(job, &ray, p, d_distance, d_motion, d_depth, d_silhouette, edge);
 }
 
 /* Upstream gradients that are not finite count as 0. */
@@ -16118,7 +16143,7 @@ static void disti_backward_outline(disti_render_backward_job *job, size_t first,
     }
     memset(&ray, 0, sizeof ray); /* a seed asks for no direction */
     for (size_t i = 0; i < n; i++)
-        if (seed[i] != 0.0f) disti_backward_add(job, &ray, p + 3 * i, 0.0f, 0.0f, 0.0f, seed[i]);
+        if (seed[i] != 0.0f) disti_backward_add(job, &ray, p + 3 * i, 0.0f, 0.0f, 0.0f, seed[i], 0);
 }
 
 /* `count` pixels, at most DISTI_RUN. */

@@ -918,6 +918,84 @@ TEST(silhouette_backward_at_hits_of_analytic_fields_matches_differences)
 TEST(silhouette_backward_at_hits_of_nets_matches_differences) { image_check_nets(SILHOUETTE_HIT, NULL, 0, 5e-4); }
 /* The least f along a ray is taken where a parabola through samples has it: the gradient at that sample is exact, that
    of the least f itself is off by as much as the sample. The box's and a ReLU net's least f is at a kink: left out. */
+/* A half space, x < .1 about (.1, -.2, .3). */
+static void half_space_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    (void)user;
+    (void)worker;
+    for (size_t i = 0; i < n; i++) {
+        sdf[i] = 0.8f * points[3 * i] + 0.6f * points[3 * i + 1] + 0.04f;
+        if (!gradient) continue;
+        gradient[3 * i] = 0.8f;
+        gradient[3 * i + 1] = 0.6f;
+        gradient[3 * i + 2] = 0;
+    }
+}
+
+/* Where |f| is least at an end of the ray's part of the bounding sphere, which the surface leaves here, that end moves
+   along the ray with the camera. Differences of the silhouette itself. */
+TEST(silhouette_backward_at_the_bounding_sphere_is_its_difference)
+{
+    enum { W = 24, N = W * W };
+    static float silhouette[3][N], seed[N];
+    static unsigned char status[N];
+    dist_context *ctx = test_context();
+    dist_field field;
+    const float eye[3] = {0.05f, 0.3f, 3.2f}, at[3] = {0.3f, -0.1f, 0};
+    int checked = 0, inside = 0;
+    memset(&field, 0, sizeof field);
+    field.eval_fn = half_space_eval;
+    field.radius = 1;
+    field.center[0] = 0.1f;
+    field.center[1] = -0.2f;
+    field.center[2] = 0.3f;
+    dist_camera camera = dist_camera_look_at(W, W, 0.9f, eye, at, NULL);
+    dist_tape *tape = dist_tape_create(ctx, &camera, NULL);
+    dist_images out;
+    memset(&out, 0, sizeof out);
+    out.silhouette = silhouette[0];
+    out.status = status;
+    CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, tape), ctx);
+    for (int pixel = 0; pixel < N; pixel += 5) {
+        float got[6] = {0, 0, 0, 0, 0, 0};
+        dist_images d_out;
+        dist_gradients grads;
+        if (status[pixel] != DIST_RAY_MISS && status[pixel] != DIST_RAY_INSIDE) continue;
+        if (silhouette[0][pixel] < 0.002f || silhouette[0][pixel] > 0.27f) continue; /* far off it is interpolated */
+        memset(seed, 0, sizeof seed);
+        memset(&d_out, 0, sizeof d_out);
+        memset(&grads, 0, sizeof grads);
+        seed[pixel] = 1;
+        d_out.silhouette = seed;
+        grads.rotation = got;
+        grads.translation = got + 3;
+        CHECK_STATUS(DIST_OK, dist_render_backward(ctx, tape, &d_out, &grads), ctx);
+        for (int k = 0; k < 6; k++) {
+            const float h = 1e-3f;
+            double difference = 0, bend = -2 * (double)silhouette[0][pixel];
+            for (int side = 0; side < 2; side++) {
+                float step[6] = {0, 0, 0, 0, 0, 0};
+                dist_camera moved = camera;
+                step[k] = side ? h : -h;
+                dist_camera_move(&moved, step, step + 3);
+                out.silhouette = silhouette[1 + side];
+                out.status = NULL;
+                CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &moved, NULL, &out, NULL), ctx);
+                difference += (side ? 1 : -1) * (double)silhouette[1 + side][pixel] / (2 * (double)h);
+                bend += (double)silhouette[1 + side][pixel];
+            }
+            if (fabs(bend) > 2e-5) continue; /* beside the sphere's outline, or from one end to the other */
+            CHECK_NEAR(difference, (double)got[k], 6e-3 * fmax(1, fabs(difference)));
+            checked++;
+            inside += status[pixel] == DIST_RAY_INSIDE;
+        }
+    }
+    CHECK(checked > 100 && inside > 30);
+    if (test_state.verbose) printf("    %d numbers, %d of rays that start in the solid\n", checked, inside);
+    dist_tape_destroy(tape);
+    dist_context_destroy(ctx);
+}
+
 TEST(silhouette_backward_at_misses_is_the_derivative_at_the_sample)
 {
     image_check_analytic(SILHOUETTE_SAMPLE, NULL, TORUS, 5e-4);
@@ -2161,6 +2239,7 @@ int main(int argc, char **argv)
     RUN(distance_backward_of_nets_matches_differences);
     RUN(silhouette_backward_at_hits_of_analytic_fields_matches_differences);
     RUN(silhouette_backward_at_hits_of_nets_matches_differences);
+    RUN(silhouette_backward_at_the_bounding_sphere_is_its_difference);
     RUN(silhouette_backward_at_misses_is_the_derivative_at_the_sample);
     RUN(silhouette_backward_at_misses_is_near_the_derivative_of_the_least_value);
     RUN(silhouette_backward_off_the_sphere_moves_only_the_camera);

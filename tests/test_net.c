@@ -1325,7 +1325,8 @@ TEST(tensors_that_do_not_fit_are_refused_with_a_sentence)
     REFUSED(DIST_BAD_FILE, "bias", "", "lin0.weight 4 5;lin1.weight 1 4;lin1.bias 1;");
     REFUSED(DIST_BAD_FILE, "lin0.bias has 3 numbers, must have 4", "",
             "lin0.weight 4 5;lin0.bias 3;lin1.weight 1 4;lin1.bias 1;");
-    REFUSED(DIST_BAD_FILE, "layer 1 is 6 wide at its input, but what feeds it has 4", "", "lin0.weight 4 5;lin0.bias 4;lin1.weight 1 6;lin1.bias 1;");
+    REFUSED(DIST_BAD_FILE, "layer 1 is 6 wide at its input, but what feeds it has 4", "",
+            "lin0.weight 4 5;lin0.bias 4;lin1.weight 1 6;lin1.bias 1;");
     REFUSED(DIST_BAD_FILE, "(out, in)", "", "lin0.weight 20;lin0.bias 4;");
     REFUSED(DIST_BAD_FILE, "no tensor is called lin0.weight", "", "layer.weight 4 5;");
     REFUSED(DIST_BAD_FILE, "lin", "", "lin0.weight 4 2;lin0.bias 4;lin1.weight 1 4;lin1.bias 1;");
@@ -1418,9 +1419,9 @@ TEST(metadata_that_means_nothing_is_refused_with_a_sentence)
     for (int k = 0; k < 40; k++) strcat(list, "1,");
     strcat(list, "\"");
     REFUSED(DIST_BAD_FILE, "dist.skip", list, good_tensors);
-    REFUSED(DIST_BAD_FILE, "dist.encoding is fourier, so its levels must be 1 to 16",
+    REFUSED(DIST_BAD_FILE, "dist.encoding is fourier, so its levels are 1 to 16, not 0",
             "\"dist.encoding\":\"fourier\",\"dist.encoding.raw\":\"0\"", good_tensors);
-    REFUSED(DIST_BAD_FILE, "must be 1 to 16", "\"dist.encoding\":\"fourier\"", good_tensors);
+    REFUSED(DIST_BAD_FILE, "levels are 1 to 16, not 0", "\"dist.encoding\":\"fourier\"", good_tensors);
     REFUSED(DIST_BAD_FILE, "dist.encoding.levels is 4, which only fourier has",
             "\"dist.encoding.levels\":\"4\"", good_tensors);
 }

@@ -839,10 +839,11 @@ TEST(a_small_net_says_how_it_rounds)
     static dist_hit hits[RAYS];
     dist_context *ctx = test_context();
     test_random r = test_random_seed(31);
+    int before = 0, after = 0;
     for (int k = 0; k < 16; k++) {
         dist_net_desc d;
         double bound = pow(10, -(k / 4)), worst = 0;
-        int found = 0, off = 0;
+        int found = 0, off[2] = {0, 0};
         memset(&d, 0, sizeof d);
         d.layers = 3;
         d.width = 48;
@@ -877,30 +878,37 @@ TEST(a_small_net_says_how_it_rounds)
             CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &field, 1, q, &f, NULL), ctx);
             worst = fmax(worst, fabs((double)f - plain_eval(&d, weights, p)));
         }
-        CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, RAYS, from, to, NULL, hits, NULL), ctx);
-        for (int i = 0; i < RAYS; i++) {
-            double length = 0, f[2], e = 1.01 * (double)hits[i].error + 3e-7 * bound;
-            if (hits[i].status != DIST_RAY_HIT) continue;
-            for (int j = 0; j < 3; j++) length += (double)to[3 * i + j] * (double)to[3 * i + j];
-            for (int side = 0; side < 2; side++) {
-                double p[3], t = ((double)hits[i].distance + (side ? e : -e)) / sqrt(length);
-                for (int j = 0; j < 3; j++) p[j] = (double)from[3 * i + j] + t * (double)to[3 * i + j];
-                f[side] = plain_eval(&d, weights, p);
+        for (int told = 0; told < 2; told++) { /* what it would be without the figure, and with it */
+            dist_field traced = field;
+            traced.noise = told ? field.noise : 0.0f;
+            CHECK_STATUS(DIST_OK, dist_trace(ctx, &traced, RAYS, from, to, NULL, hits, NULL), ctx);
+            for (int i = 0; i < RAYS; i++) {
+                double length = 0, f[2], e = 1.01 * (double)hits[i].error + 3e-7 * bound;
+                if (hits[i].status != DIST_RAY_HIT) continue;
+                for (int j = 0; j < 3; j++) length += (double)to[3 * i + j] * (double)to[3 * i + j];
+                for (int side = 0; side < 2; side++) {
+                    double p[3], t = ((double)hits[i].distance + (side ? e : -e)) / sqrt(length);
+                    for (int j = 0; j < 3; j++) p[j] = (double)from[3 * i + j] + t * (double)to[3 * i + j];
+                    f[side] = plain_eval(&d, weights, p);
+                }
+                found += told;
+                off[told] += f[0] * f[1] > 0;
             }
-            found++;
-            off += f[0] * f[1] > 0;
         }
         double figure = fmax(5e-7 * bound, (double)field.noise);
         if (test_state.verbose)
-            printf("    bound %g, activation %d: f off by %.1e, figure %.1e; %d of %d hits beyond their error\n", bound,
-                   d.activation, worst, figure, off, found);
+            printf("    bound %g, activation %d: f off by %.1e, figure %.1e; %d hits, %d beyond their error, %d without\n",
+                   bound, d.activation, worst, figure, found, off[1], off[0]);
         CHECK(worst < 2 * figure);
         CHECK(figure < 30 * worst + 6e-7 * bound);
-        CHECK(found > 60 && off * 25 <= found);
+        CHECK(found > 60 && off[1] * 25 <= found);
+        before += off[0];
+        after += off[1];
         free(weights);
         dist_shape_destroy(shape);
         dist_net_destroy(net);
     }
+    CHECK(before > 20 && 10 * after <= before);
     dist_context_destroy(ctx);
 }
 

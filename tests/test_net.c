@@ -897,7 +897,7 @@ TEST(a_small_net_says_how_it_rounds)
         }
         double figure = fmax(5e-7 * bound, (double)field.noise);
         if (test_state.verbose)
-            printf("    bound %g, activation %d: f off by %.1e, figure %.1e; %d hits, %d beyond their error, %d without\n",
+            printf("    bound %g, activation %d: f off by %.1e, figure %.1e; %d hits, %d beyond their error (%d)\n",
                    bound, d.activation, worst, figure, found, off[1], off[0]);
         CHECK(worst < 2 * figure);
         CHECK(figure < 30 * worst + 6e-7 * bound);

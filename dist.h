@@ -236,7 +236,7 @@ typedef struct dist_field {
     float clamp;     /* |f| above this carries no distance (a clamped training); 0: none */
     float detail;    /* the radius of the smallest part that is to be found: the defaults of how.epsilon, normal_delta
                         and of how far a ray goes on trust go by it; 0: radius */
-    float noise;     /* how far rounding takes f off, which no hit's error is below: counted as 5e-7 of the radius where
+    float noise;     /* how far rounding takes f off, part of every hit's error: counted as 5e-7 of the radius where
                         that is more. A net's is sampled by dist_shape_create */
     /* multiply-adds of a query, about; a net's field has its own. Below 5000 a picture without silhouette and tape is
        traced with more queries and less bookkeeping: 1 where frames a second count, 0 where queries do */
@@ -16195,7 +16195,7 @@ DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *ta
     if (status != DIST_OK) return status;
     memset(&job, 0, sizeof job);
     size_t size = (size_t)tape->field.code_size + (size_t)tape->field.color_code_size, room = ctx->partial_size - 1;
-    if (!grads->code && !d_out->color) size = 0; /* no code's gradient is summed */
+    if (!grads->code && !grads->color_code && !d_out->color) size = 0; /* no code's gradient is summed */
     if (size + size / DISTI_SLOTS > room) /* see disti_partial_for */
         return disti_fail(ctx, DIST_UNSUPPORTED, "%s: the field's codes have %d numbers, at most %d here", name,
                           (double)size, (double)(room - room / (DISTI_SLOTS + 1)));

@@ -918,6 +918,98 @@ TEST(silhouette_backward_at_hits_of_analytic_fields_matches_differences)
 TEST(silhouette_backward_at_hits_of_nets_matches_differences) { image_check_nets(SILHOUETTE_HIT, NULL, 0, 5e-4); }
 /* The least f along a ray is taken where a parabola through samples has it: the gradient at that sample is exact, that
    of the least f itself is off by as much as the sample. The box's and a ReLU net's least f is at a kink: left out. */
+/* Adjoints of codes that nobody should ask for: each number gets 1. */
+static void long_adjoint(void *user, int worker, size_t n, const float *points, const float *d_sdf, double *d_code)
+{
+    const int *size = (const int *)user;
+    (void)worker;
+    (void)points;
+    (void)d_sdf;
+    for (int j = 0; n > 0 && j < *size; j++) d_code[j] += 1;
+}
+
+static void long_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    (void)user;
+    (void)worker;
+    for (size_t i = 0; i < n; i++, points += 3) {
+        float length = sqrtf(points[0] * points[0] + points[1] * points[1] + points[2] * points[2]);
+        sdf[i] = length - 0.5f;
+        for (int k = 0; gradient && k < 3; k++) gradient[3 * i + (size_t)k] = points[k] / fmaxf(length, 1e-6f);
+    }
+}
+
+static void long_color(void *user, int worker, size_t n, const float *points, float *color)
+{
+    (void)user;
+    (void)worker;
+    (void)points;
+    for (size_t i = 0; i < 3 * n; i++) color[i] = 0.5f;
+}
+
+static void long_color_adjoint(void *user, int worker, size_t n, const float *points, const float *d_color,
+                               float *d_points, double *d_code, double *d_color_code)
+{
+    (void)user;
+    (void)worker;
+    (void)n;
+    (void)points;
+    (void)d_color;
+    (void)d_points;
+    (void)d_code;
+    (void)d_color_code;
+}
+
+/* A camera's gradient does not depend on how long the code is; the code's is refused beyond what there is room for. */
+TEST(long_codes_matter_only_where_their_gradient_is_wanted)
+{
+    enum { W = 16, LONG = 2000 };
+    static float depth[W * W], ones[W * W], code[LONG];
+    dist_context *ctx = test_context();
+    const float eye[3] = {0.2f, 0.1f, 2};
+    dist_camera camera = dist_camera_look_at(W, W, 0.7f, eye, NULL, NULL);
+    float got[2][3] = {{0, 0, 0}, {0, 0, 0}};
+    for (int i = 0; i < W * W; i++) ones[i] = 1;
+    for (int k = 0; k < 2; k++) {
+        int size = k ? LONG : 4;
+        dist_field field;
+        dist_images out, d_out;
+        dist_gradients grads;
+        memset(&field, 0, sizeof field);
+        field.user = &size;
+        field.eval_fn = long_eval;
+        field.adjoint_fn = long_adjoint;
+        field.color_fn = long_color;
+        field.color_adjoint_fn = long_color_adjoint;
+        field.code_size = size;
+        field.color_code_size = 8;
+        field.radius = 1;
+        memset(&out, 0, sizeof out);
+        memset(&d_out, 0, sizeof d_out);
+        memset(&grads, 0, sizeof grads);
+        out.depth = depth;
+        d_out.depth = ones;
+        dist_tape *tape = dist_tape_create(ctx, &camera, NULL);
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, tape), ctx);
+        grads.translation = got[k];
+        CHECK_STATUS(DIST_OK, dist_render_backward(ctx, tape, &d_out, &grads), ctx);
+        grads.translation = NULL;
+        grads.color_code = code; /* no color has an upstream gradient: nothing is added */
+        code[3] = 5;
+        CHECK_STATUS(k ? DIST_UNSUPPORTED : DIST_OK, dist_render_backward(ctx, tape, &d_out, &grads), ctx);
+        CHECK(code[3] == 5.0f);
+        grads.color_code = NULL;
+        grads.code = code;
+        CHECK_STATUS(k ? DIST_UNSUPPORTED : DIST_OK, dist_render_backward(ctx, tape, &d_out, &grads), ctx);
+        CHECK(k ? code[3] == 5.0f : code[3] > 5.5f);
+        dist_context_clear(ctx);
+        dist_tape_destroy(tape);
+    }
+    CHECK_BYTES(sizeof got[0], got[0], got[1]);
+    CHECK(fabsf(got[0][2]) > 10);
+    dist_context_destroy(ctx);
+}
+
 /* A half space, x < .1 about (.1, -.2, .3). */
 static void half_space_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
 {
@@ -2239,6 +2331,7 @@ int main(int argc, char **argv)
     RUN(distance_backward_of_nets_matches_differences);
     RUN(silhouette_backward_at_hits_of_analytic_fields_matches_differences);
     RUN(silhouette_backward_at_hits_of_nets_matches_differences);
+    RUN(long_codes_matter_only_where_their_gradient_is_wanted);
     RUN(silhouette_backward_at_the_bounding_sphere_is_its_difference);
     RUN(silhouette_backward_at_misses_is_the_derivative_at_the_sample);
     RUN(silhouette_backward_at_misses_is_near_the_derivative_of_the_least_value);

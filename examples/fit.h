@@ -22,7 +22,7 @@ typedef struct fit_options {
 
 #define FIT_USAGE                                                                                     \
     "  MODEL              a safetensors file, or the word embedded (default)\n"                       \
-    "  --target WHICH     what is seen: a shape of the model, by INDEX or a code's FILE\n"            \
+    "  --target WHICH     what is seen: a shape of the model, by INDEX or a code's FILE (default 0)\n" \
     "  --depth FILE.pfm   or: a depth image; 0, infinity or above 1e5 where nothing is seen\n"        \
     "  --mask FILE.pfm    its silhouette, not 0 inside (default: where there is depth)\n"             \
     "  --no-mask          use no silhouette\n" VIEW_USAGE                                             \
@@ -103,7 +103,6 @@ static inline int option_fit(options *o, fit_options *f)
 static inline void check_fit_options(const fit_options *f)
 {
     if (f->depth_path && f->target) { fail("--depth and --target are two observations; give one"); }
-    if (f->mask_path && !f->depth_path) { fail("--mask belongs to --depth FILE.pfm"); }
     if (f->no_mask && !(f->weights[0] > 0.0f)) {
         fail("--no-mask and a weight of 0 for the depth leave nothing to fit");
     }
@@ -201,10 +200,26 @@ static inline int is_depth(float depth)
     return depth > 0.0f && depth < 1e5f;
 }
 
-/* --depth and --mask. The view gets their size. */
-static inline observation observe_files(dist_context *ctx, fit_options *o)
+/* --mask, if it is given, in place of where the depth is. */
+static inline void observe_mask(dist_context *ctx, const char *path, observation *s)
 {
-    const char *depth_path = o->depth_path, *mask_path = o->mask_path;
+    if (!path) { return; }
+    int width = 0;
+    int height = 0;
+    float *mask = load_plane(ctx, path, &width, &height);
+    if (width != s->width || height != s->height) {
+        fail("%s is %d x %d, but the depth image is %d x %d", path, width, height, s->width, s->height);
+    }
+    for (size_t i = 0; i < s->n; i++) {
+        s->mask[i] = mask[i] > 0.0f || mask[i] < 0.0f;
+    }
+    dist_pfm_free(ctx, mask, width, height, 1);
+}
+
+/* --depth. The view gets its size. */
+static inline observation observe_file(dist_context *ctx, fit_options *o)
+{
+    const char *depth_path = o->depth_path;
     int width = 0;
     int height = 0;
     float *depth = load_plane(ctx, depth_path, &width, &height);
@@ -219,17 +234,6 @@ static inline observation observe_files(dist_context *ctx, fit_options *o)
         s.depth[i] = s.mask[i] ? depth[i] : 0.0f;
     }
     dist_pfm_free(ctx, depth, width, height, 1);
-    if (!mask_path) { return s; }
-    int mask_width = 0;
-    int mask_height = 0;
-    float *mask = load_plane(ctx, mask_path, &mask_width, &mask_height);
-    if (mask_width != width || mask_height != height) {
-        fail("%s is %d x %d, but the depth image is %d x %d", mask_path, mask_width, mask_height, width, height);
-    }
-    for (size_t i = 0; i < s.n; i++) {
-        s.mask[i] = mask[i] > 0.0f || mask[i] < 0.0f;
-    }
-    dist_pfm_free(ctx, mask, width, height, 1);
     return s;
 }
 

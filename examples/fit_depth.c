@@ -8,7 +8,7 @@
 #include "shapes.h"
 
 static const char usage[] =
-    "fit_depth [MODEL] --target WHICH | --depth FILE.pfm | --demo [options] --out STEM\n" FIT_USAGE
+    "fit_depth [MODEL] [--target WHICH | --depth FILE.pfm | --demo] [options] --out STEM\n" FIT_USAGE
     "  --start WHICH      zero (default), mean, random:SEED, INDEX or FILE: the code to begin with\n"
     "  --demo             see a shape that the embedded model was never shown, 5 % of its pixels, start from the mean\n"
     "  --demo-family NAME of sofas (default), planes, tables, cars: what the shape is\n"
@@ -391,10 +391,10 @@ static request read_options(int argc, char **argv)
         }
     }
     if (told && !r.demo) { fail("--demo-family and --demo-shape say what --demo sees; without it they mean nothing"); }
-    if (r.demo && (o->depth_path || o->target)) { fail("--demo sees its own shape; leave out --target and --depth"); }
-    if (!r.demo && !o->depth_path && !o->target) {
-        fail("what is seen? give --target, --depth or --demo; --help tells more");
+    if (r.demo && (o->depth_path || o->target || o->mask_path)) {
+        fail("--demo sees its own shape; leave out --target, --depth and --mask");
     }
+    if (!r.demo && !o->depth_path && !o->target) { o->target = "0"; }
     check_fit_options(o);
     option_belongs(r.warm && (o->how.trace == DIST_TRACE_PAPER || o->no_mask || !(o->weights[1] > 0.0f)), "--warm",
                    "starts the guarded tracer's pictures, those with a silhouette");
@@ -415,8 +415,9 @@ static observation observe(dist_context *ctx, const dist_net *net, request *r, d
     dist_mesh *mesh = NULL;
     *points = NULL;
     if (o->depth_path) {
-        seen = observe_files(ctx, o);
+        seen = observe_file(ctx, o);
         *camera = view_camera(&o->view, 0.0f);
+        observe_mask(ctx, o->mask_path, &seen);
         return seen;
     }
     if (!o->view.width) { o->view.width = o->view.height = 128; }
@@ -437,6 +438,7 @@ static observation observe(dist_context *ctx, const dist_net *net, request *r, d
         free(code);
     }
     dist_mesh_destroy(mesh);
+    observe_mask(ctx, o->mask_path, &seen);
     return seen;
 }
 

@@ -651,7 +651,7 @@ static observation observe(dist_context *ctx, const dist_net *net, request *r, c
     fit_options *o = &r->fit;
     observation seen;
     if (o->depth_path) {
-        seen = observe_files(ctx, o);
+        seen = observe_file(ctx, o);
         *camera = view_camera(&o->view, 0.0f);
     } else {
         *camera = view_camera(&o->view, 0.0f);
@@ -660,6 +660,7 @@ static observation observe(dist_context *ctx, const dist_net *net, request *r, c
         seen = observe_field(ctx, &field, camera);
         dist_shape_destroy(shape);
     }
+    observe_mask(ctx, o->mask_path, &seen);
     observation_keep(&seen, o->keep, o->points, (unsigned)o->seed);
     return seen;
 }
@@ -744,6 +745,8 @@ static request read_options(int argc, char **argv)
             r.refine = option_int(&walk, 0, 1000);
         } else if (option_is(&walk, "--restarts")) {
             r.restarts = option_int(&walk, 0, 1000);
+        } else if (option_is(&walk, "--start")) {
+            fail("--start is a code to begin with, and here the shape is known; --off says where the camera begins");
         } else if (!option_fit(&walk, o)) {
             option_unknown(&walk);
         }
@@ -752,7 +755,9 @@ static request read_options(int argc, char **argv)
     if (o->depth_path) { checked.target = NULL; } /* here the one is the shape, the other the picture of it */
     check_fit_options(&checked);
     if (o->weights[2] > 0.0f) { fail("--weights D,S,0: there is no code to weigh here"); }
-    if (r.trials && o->depth_path) { fail("--trials renders its own observations; leave out --depth"); }
+    if (r.trials && (o->depth_path || o->mask_path)) {
+        fail("--trials renders its own observations; leave out --depth and --mask");
+    }
     if (!o->out && !r.trials) { fail("--out STEM is needed: where the results go"); }
     if (!o->model) { o->model = "embedded"; }
     if (!o->view.width && !o->depth_path) { o->view.width = o->view.height = 64; }

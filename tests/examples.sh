@@ -61,6 +61,17 @@ tells_all() {
     done
 }
 expect fit_depth_tells_all tells_all "$work/fit_depth" --demo --size 32 --iterations 2
+expect fit_depth_tells_all_of_a_target tells_all "$work/fit_depth" --size 32 --iterations 2
+# The mask may be another picture's, with the depth of a shape of the model, too.
+masked() {
+    "$work/render" embedded --code 1 --size 32x32 --planes depth --out "$work/mask" &&
+        tells_all "$work/$1" --target 0 --size 32x32 --iterations 2 --mask "$work/mask_depth.pfm" &&
+        seen=$(sed -n 's/^  "pixels_seen": \([0-9]*\).*/\1/p' "$work/told.json") &&
+        tells_all "$work/$1" --target 0 --size 32x32 --iterations 2 &&
+        all=$(sed -n 's/^  "pixels_seen": \([0-9]*\).*/\1/p' "$work/told.json") && [ "$seen" -lt "$all" ]
+}
+expect fit_depth_takes_a_mask masked fit_depth
+expect fit_pose_takes_a_mask masked fit_pose
 expect fit_pose_tells_all tells_all "$work/fit_pose" --size 32 --iterations 2 --restarts 0
 expect fit_photos_tells_all tells_all "$work/fit_photos" --views 3 --size 24x24 --iterations 2
 expect fit_photos_of_a_mesh_tell_all tells_all "$work/fit_photos" --views 3 --size 24x24 --iterations 2 --gradient mesh
@@ -91,6 +102,10 @@ refuses lights_below_0 "no color below 0" "$work/render" embedded --light 1,0,0,
 refuses meshes_of_other_formats "FILE.obj is needed" "$work/mesh" embedded --out "$work/x.stl"
 refuses a_fit_of_nothing "nothing to fit" "$work/fit_depth" --demo --weights 0,0,1 --out "$work/x"
 refuses weights_below_0 "must not be negative" "$work/fit_depth" --demo --weights 1,-1,0 --out "$work/x"
+refuses a_mask_of_another_size "but the depth image is" "$work/fit_depth" --size 33 --mask "$work/mask_depth.pfm" --out "$work/x"
+refuses a_code_to_begin_with_of_a_known_shape "the shape is known" "$work/fit_pose" --start zero --out "$work/x"
+refuses trials_with_a_mask "renders its own observations" "$work/fit_pose" --trials 2 --mask "$work/mask_depth.pfm"
+refuses a_demo_with_a_mask "its own shape" "$work/fit_depth" --demo --mask "$work/mask_depth.pfm" --out "$work/x"
 refuses a_demo_of_a_family_without_demo "they mean nothing" "$work/fit_depth" --demo-family planes --target 0 --out "$work/x"
 refuses two_observations "two observations" "$work/fit_photos" --photos none.txt --target 1 --out "$work/x"
 refuses starts_off_below_0 "0 to 180 degrees" "$work/fit_pose" --off -1,0 --out "$work/x"

@@ -28,11 +28,13 @@
 #ifndef DIST_TEST_H
 #define DIST_TEST_H
 
-/* TEST_SHARED: the implementation is linked in, for programs that use nothing beyond the declarations. */
-#if !defined(DIST_IMPLEMENTATION) && !defined(TEST_SHARED)
+/* TEST_INSIDE: this program has in itself what it uses of the implementation; the others are linked with inside.c. */
+#ifdef TEST_INSIDE
 #define DIST_IMPLEMENTATION
+#define DIST_STATIC
 #endif
 #include "../dist.h"
+#include "inside.h"
 
 #include <math.h>
 #include <stdint.h>
@@ -136,6 +138,13 @@ TEST_UNUSED static int test_finite(double x)
     uint64_t bits;
     memcpy(&bits, &x, sizeof bits);
     return (bits & 0x7ff0000000000000u) != 0x7ff0000000000000u;
+}
+
+TEST_UNUSED static int test_finite_all(size_t n, const float *x)
+{
+    for (size_t i = 0; i < n; i++)
+        if (!test_finite((double)x[i])) return 0;
+    return 1;
 }
 
 TEST_UNUSED static int test_check(int good, const char *what, const char *file, int line)
@@ -369,16 +378,6 @@ TEST_UNUSED static dist_allocator test_allocator_hook(test_allocator *a)
     hook.free_fn = test_free;
     return hook;
 }
-
-#ifndef TEST_SHARED
-/* Fills what the context's workers work in: no result may depend on what an earlier call has left there. */
-TEST_UNUSED static void test_soil(dist_context *ctx, int byte)
-{
-    memset(ctx->scratch, byte, (size_t)ctx->workers * DISTI_SCRATCH_BYTES);
-    if (ctx->lanes) memset(ctx->lanes, byte, (size_t)ctx->workers * ctx->lane_bytes);
-    if (ctx->partial) memset(ctx->partial, byte, DISTI_SLOTS * ctx->partial_size * sizeof(double));
-}
-#endif
 
 /* ---- a scheduler without threads --------------------------------------------------------------------------------- */
 

@@ -1,5 +1,6 @@
 /* SPDX-License-Identifier: MIT-0
    test_archive.c - the safetensors reader and writer, and the numbers of its metadata */
+#define TEST_INSIDE
 #include "test.h"
 
 #define LESSER(a, b) ((a) < (b) ? (a) : (b))

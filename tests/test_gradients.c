@@ -268,7 +268,7 @@ static dist_context *scene_context(void)
 static void scene_numbers(scene *s)
 {
     for (int i = 0; i < 9; i++) s->rotation[i] = (double)s->camera.rotation[i];
-    disti_orthonormalize(s->rotation);
+    inside_orthonormalize(s->rotation);
     for (int i = 0; i < 3; i++) s->translation[i] = (double)s->camera.translation[i];
     s->focal[0] = (double)s->camera.fx;
     s->focal[1] = (double)s->camera.fy;
@@ -715,7 +715,7 @@ static int pixel_use(const scene *s, image_job *job, const pictures *a, const di
         /* the sample as the tape has it: measured from the point of the ray that is nearest to the center */
         for (int k = 0; k < 3 && job->plane == SILHOUETTE_SAMPLE; k++)
             job->t[i] = (k ? job->t[i] : 0.0) - r.origin[k] * r.direction[k];
-        if (job->plane == SILHOUETTE_SAMPLE) job->t[i] += (double)tape->s[i];
+        if (job->plane == SILHOUETTE_SAMPLE) job->t[i] += (double)inside_tape_of(tape).s[i];
         return fabs(least - (double)a->silhouette[i] - (double)a->stats.epsilon) < 3e-4 ? 1 : -1;
     }
     if (a->status[i] != DIST_RAY_HIT) return 0;
@@ -1471,7 +1471,7 @@ TEST(paper_mode_after_the_papers_tracer_is_alpha_df_summed_over_the_samples)
             if (!chord(&s, &r, &enter, &leave)) continue;
             if (a.mask[i]) tilt_at(&s, i, (double)a.distance[i], (double)w[i], &expected);
             for (int j = 0; j < how.samples; j++) {
-                const float *sample = tape->sample + (i * how.samples + j) * 4;
+                const float *sample = inside_tape_of(tape).sample + (i * how.samples + j) * 4;
                 float seed = j > 0 ? 0.0f : a.mask[i] || !(sample[0] < 0.0f) ? ws[i] : -ws[i]; /* of |f| */
                 if (a.mask[i] && fabsf(sample[0]) <= 0.1f) seed += alpha * (float)r.z * w[i];
                 if (fabsf(sample[0]) > 1e30f) continue; /* fewer than K samples */

@@ -1,5 +1,6 @@
 /* SPDX-License-Identifier: MIT-0
    test_half.c - networks in 16 bits: each kernel against f32, ragged sizes, overflow, what is refused */
+#define TEST_INSIDE
 #include "test.h"
 
 #include "../examples/common.h"

@@ -2,6 +2,7 @@
    Each kernel of each instruction set against the formula of section 03, computed in double.
    What a kernel has no business reading (unlisted rows, columns beyond the last, padding) is NaN, so that a value which
    leaks from there shows itself; what it has no business writing must keep its bytes. */
+#define TEST_INSIDE
 #include "test.h"
 
 #include <float.h>

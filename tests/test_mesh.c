@@ -128,16 +128,15 @@ static dist_field mesh_field(void *user, void (*eval_fn)(void *, int, size_t, co
 
 TEST(every_cube_case_fans_closed_loops_without_diagonals_in_faces)
 {
-    disti_case cases[256];
     int most = 0;
-    disti_cases(cases);
     for (int code = 0; code < 256; code++) {
-        const disti_case *c = cases + code;
+        unsigned char edges[18];
+        int count = inside_cube(code, edges);
         int uses[24][24], crossed = 0;
         memset(uses, 0, sizeof uses);
-        most = c->triangles > most ? c->triangles : most;
-        for (int i = 0; i < c->triangles; i++)
-            for (int k = 0; k < 3; k++) uses[c->edges[3 * i + k]][c->edges[3 * i + (k + 1) % 3]]++;
+        most = count > most ? count : most;
+        for (int i = 0; i < count; i++)
+            for (int k = 0; k < 3; k++) uses[edges[3 * i + k]][edges[3 * i + (k + 1) % 3]]++;
         for (int e = 0; e < 24; e++) {
             int out = 0, edge = (e & 1 << (e >> 3)) == 0;
             int is_crossed = edge && ((code >> (e & 7) ^ code >> ((e & 7) | 1 << (e >> 3))) & 1);
@@ -145,13 +144,13 @@ TEST(every_cube_case_fans_closed_loops_without_diagonals_in_faces)
                 CHECK(uses[e][f] <= 1);
                 out += uses[e][f];
                 /* an edge within the cell is used both ways, one in a face only one way */
-                if (uses[e][f] && uses[f][e]) CHECK(!disti_edges_share_face(e, f));
-                if (uses[e][f] && !uses[f][e]) CHECK(disti_edges_share_face(e, f));
+                if (uses[e][f] && uses[f][e]) CHECK(!inside_edges_share_face(e, f));
+                if (uses[e][f] && !uses[f][e]) CHECK(inside_edges_share_face(e, f));
             }
             CHECK_EQUAL(is_crossed, out > 0);
             crossed += is_crossed;
         }
-        if (crossed == 0) CHECK_EQUAL(0, c->triangles);
+        if (crossed == 0) CHECK_EQUAL(0, count);
     }
     CHECK(most <= 6);
 }
@@ -227,7 +226,7 @@ TEST(random_noise_is_closed_in_all_256_cases)
         CHECK(mesh->triangle_count > 0);
         CHECK(mesh_closed(mesh));
         CHECK(mesh_volume(mesh, NULL) > 0);
-        CHECK(disti_finite_all(3 * mesh->vertex_count, mesh->vertices));
+        CHECK(test_finite_all(3 * mesh->vertex_count, mesh->vertices));
         dist_mesh_destroy(mesh);
     }
     dist_context_destroy(ctx);

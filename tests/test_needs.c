@@ -1,6 +1,7 @@
 /* SPDX-License-Identifier: MIT-0
    What a scene does not need it does not pay for: the rows of bench/bench_needs.c, by their counts; and the reference
    in double that bench_work_precision measures against. */
+#define TEST_INSIDE
 #include "test.h"
 #include "../examples/common.h"
 #include "../bench/bench.h"

@@ -381,51 +381,6 @@ TEST(gradients_of_lone_points_are_finite_where_those_of_others_are)
     CHECK(tiny > 0);
 }
 
-/* Every point once, whatever they are: in a box, on a line, at a few places only, all alike, not finite. Each cell is
-   small where they are spread out, and what ends a group lies on one side of what begins the next. */
-TEST(points_put_in_order_are_all_there_and_neighbors_stand_together)
-{
-    enum { MOST = 3000, CELL = DISTI_CELL_POINTS };
-    static float points[3 * MOST];
-    static disti_place place[MOST];
-    static unsigned char seen[MOST];
-    const int counts[] = {0, 1, 2, CELL, CELL + 1, DISTI_BLOCK + 1, DISTI_GROUP_POINTS, 1000, MOST};
-    test_random r = test_random_seed(11);
-    for (int kind = 0; kind < 5; kind++) {
-        for (size_t c = 0; c < sizeof counts / sizeof counts[0]; c++) {
-            int n = counts[c], once = 1;
-            double extent = 0;
-            for (int i = 0; i < 3 * n; i++) {
-                float x = test_random_float(&r, -1, 1);
-                points[i] = kind == 0                ? x
-                            : kind == 1              ? (i % 3 == 1 ? x : 0.0f)
-                            : kind == 2              ? floorf(2 * x)
-                            : kind == 4 && i % 7 < 3 ? (i % 2 ? NAN : INFINITY)
-                                                     : 0.25f;
-            }
-            memset(seen, 0, sizeof seen);
-            disti_places_init(place, points, n);
-            disti_sort_places(place, 0, n, CELL);
-            for (int i = 0; i < n; i++) {
-                once &= place[i].at >= 0 && place[i].at < n && !seen[place[i].at]++;
-                once &= memcmp(place[i].p, points + 3 * place[i].at, 3 * sizeof(float)) == 0;
-            }
-            CHECK(once);
-            for (int at = 0; at + CELL <= n && kind == 0; at += CELL) {
-                for (int k = 0; k < 3; k++) {
-                    float low = 2, high = -2;
-                    for (int i = at; i < at + CELL; i++) {
-                        low = fminf(low, place[i].p[k]);
-                        high = fmaxf(high, place[i].p[k]);
-                    }
-                    extent += (double)(high - low) / (3.0 * n / CELL);
-                }
-            }
-            if (kind == 0 && n == MOST) CHECK(extent < 0.4); /* 2 / 250^(1/3) = 0.32; 1.7 in any order */
-        }
-    }
-}
-
 TEST(a_dead_unit_that_is_left_out_changes_no_bit)
 {
     for (int normed = 0; normed < 2; normed++) {
@@ -517,24 +472,21 @@ TEST(the_order_of_units_in_memory_does_not_show)
     for (int mode = 0; mode < 2; mode++) {
         dist_net *net = model_load(ctx, &m);
         int moved = 0;
-        REQUIRE(net != NULL && net->unit_order != NULL);
-        for (int l = 0; l + 1 < net->layers; l++) {
+        REQUIRE(net != NULL);
+        for (int l = 0; l < desc.hidden; l++) {
             char seen[512] = {0};
-            REQUIRE(net->layer[l].out <= 512);
-            for (int i = 0; i < net->layer[l].out; i++) {
-                int *unit = net->unit_order + l * net->max_rows + i;
-                REQUIRE(*unit >= 0 && *unit < net->layer[l].out && !seen[*unit]);
-                seen[*unit] = 1;
-                moved += *unit != i;
-                CHECK_EQUAL(i, net->unit_order[(net->layers + l) * net->max_rows + *unit]);
-            }
-            for (int i = 0; mode && i < net->layer[l].out; i++) {
-                net->unit_order[l * net->max_rows + i] = i;
-                net->unit_order[(net->layers + l) * net->max_rows + i] = i;
+            const int *unit, *place;
+            int count = inside_units(net, l, &unit, &place);
+            REQUIRE(unit != NULL && count > 0 && count <= 512);
+            for (int i = 0; i < count; i++) {
+                REQUIRE(unit[i] >= 0 && unit[i] < count && !seen[unit[i]]);
+                seen[unit[i]] = 1;
+                moved += unit[i] != i;
+                CHECK_EQUAL(i, place[unit[i]]);
             }
         }
         CHECK(moved > 100);
-        if (mode) disti_net_pack(net);
+        if (mode) inside_units_in_order(net);
         dist_shape *shape = dist_shape_create(ctx, net, dist_net_code(net, 1));
         dist_field field = dist_shape_field(shape);
         REQUIRE(field.weight_count <= WEIGHTS);
@@ -592,10 +544,10 @@ TEST(a_few_points_have_the_bits_of_many)
         field.eval_fn(field.user, 0, MANY, points, many, slopes);
         for (int n = 1; n <= MANY; n++) {
             for (int at = 0; at + n <= MANY; at += n) {
-                test_soil(ctx, 0);
+                inside_soil(ctx, 0);
                 field.eval_fn(field.user, 0, (size_t)n, points + 3 * at, few, NULL);
                 CHECK(same_values((size_t)n, many + at, few, descs[i].normed));
-                test_soil(ctx, n & 1 ? 0 : 0xff);
+                inside_soil(ctx, n & 1 ? 0 : 0xff);
                 field.eval_fn(field.user, 0, (size_t)n, points + 3 * at, few, slope);
                 CHECK(same_values((size_t)n, many + at, few, descs[i].normed));
                 CHECK(same_slopes((size_t)n, slopes + 3 * at, slope));
@@ -631,24 +583,23 @@ TEST(rows_that_are_left_out_change_no_bit)
         float spread[3] = {0.02f, 0.4f, 0.1f}; /* near each other, a sheet, and in between */
         size_t less = from > 1 && test_quick() ? 4 : 1;
         double done[3] = {0, 0, 0};
-        CHECK(shape->groups == 2 || from < 2); /* memory for them has every net that is wide enough */
+        CHECK(inside_groups(shape, 2) == 2 || from < 2); /* memory for them has every net that is wide enough */
         for (int round = 0; round < 3; round++) {
             test_random_fill(&random, 3 * MANY, points, -spread[round], spread[round]);
             for (int i = 0; i < MANY && round == 1; i++) points[3 * i] = 0.3f;
             size_t n = (round == 2 ? MANY : MANY / 2) / less;
             for (int mode = 0; mode < 3; mode++) { /* groups, blocks, one by one */
-                disti_counter *counter = disti_counter_of(ctx, 0);
-                counter->done = 0;
-                shape->groups = mode == 0 ? 2 : 0;
+                inside_done(ctx);
+                inside_groups(shape, mode == 0 ? 2 : 0);
                 for (size_t i = 0; i < n; i += mode == 2 ? 1 : n)
                     field.eval_fn(field.user, 0, mode == 2 ? 1 : n, points + 3 * i, sdf[mode] + i, NULL);
-                done[mode] += counter->done;
+                done[mode] += inside_done(ctx);
             }
             CHECK_BYTES(n * sizeof(float), sdf[1], sdf[0]);
             CHECK_BYTES(n * sizeof(float), sdf[2], sdf[0]);
             for (int mode = 0; mode < 2; mode++) { /* and with the reverse pass */
                 memset(d_code[mode], 0, sizeof d_code[mode]);
-                shape->groups = mode == 0 ? 2 : 0;
+                inside_groups(shape, mode == 0 ? 2 : 0);
                 field.fused_fn(field.user, 0, n, points, sdf[mode], gradient[mode], unit_seed, NULL, d_code[mode]);
             }
             CHECK_BYTES(n * sizeof(float), sdf[1], sdf[0]);
@@ -659,7 +610,7 @@ TEST(rows_that_are_left_out_change_no_bit)
         }
         int worse = 0; /* points that are not finite are no others' business */
         for (int i = 0; i < MANY; i += 7) points[3 * i + i % 3] = i % 2 ? NAN : INFINITY;
-        shape->groups = 2;
+        inside_groups(shape, 2);
         field.eval_fn(field.user, 0, MANY / less, points, sdf[0], NULL);
         for (size_t i = 0; i < MANY / less; i++) {
             if (i % 7 == 0) continue;
@@ -667,7 +618,7 @@ TEST(rows_that_are_left_out_change_no_bit)
             worse += memcmp(sdf[1], sdf[0] + i, sizeof(float)) != 0;
         }
         CHECK_EQUAL(0, worse);
-        CHECK(shape->wide == (from > 0));
+        CHECK(inside_is_wide(shape) == (from > 0));
         CHECK(done[0] < (from ? 0.8 : 0.95) * done[1]);
         dist_shape_destroy(shape);
         dist_net_destroy(net);
@@ -1359,9 +1310,9 @@ TEST(a_layer_missing_in_the_middle_is_refused)
 TEST(a_net_of_more_layers_than_there_can_be_is_refused)
 {
     char tensors[4096], *end = tensors;
-    for (int l = 0; l <= DISTI_MAX_LAYERS; l++)
-        end += sprintf(end, "lin%d.weight %d %d;lin%d.bias %d;", l, l < DISTI_MAX_LAYERS ? 4 : 1, l ? 4 : 5, l,
-                       l < DISTI_MAX_LAYERS ? 4 : 1);
+    for (int l = 0; l <= INSIDE_LAYERS; l++)
+        end += sprintf(end, "lin%d.weight %d %d;lin%d.bias %d;", l, l < INSIDE_LAYERS ? 4 : 1, l ? 4 : 5, l,
+                       l < INSIDE_LAYERS ? 4 : 1);
     REFUSED(DIST_UNSUPPORTED, "more than 32 layers", "", tensors);
 }
 
@@ -1453,7 +1404,7 @@ TEST(the_base_of_an_encoding_is_saved_to_the_last_bit)
         REQUIRE(again != NULL);
         unsigned char *second = saved(ctx, again, &size[2]);
         const double base = bases[k] ? strtod(bases[k], NULL) : 3.14159265358979323846;
-        CHECK(net->base == base && again->base == base);
+        CHECK(inside_encoding_base(net) == base && inside_encoding_base(again) == base);
         CHECK(size[1] == size[2] && memcmp(first, second, size[1]) == 0);
         dist_net_destroy(again);
         dist_net_destroy(net);
@@ -1556,7 +1507,7 @@ static void plain_sgemm(void *user, int transpose_a, int transpose_b, int m, int
         }
 }
 
-enum { BLAS_POINTS = 2 * DISTI_WIDE_COLUMNS + DISTI_BLOCK + 5 }; /* values alone go several blocks at a time */
+enum { BLAS_POINTS = 2 * INSIDE_WIDE + INSIDE_BLOCK + 5 }; /* values alone go several blocks at a time */
 
 typedef struct blas_result {
     float sdf[POINTS], gradient[3 * POINTS], code[5], values[BLAS_POINTS];
@@ -1817,7 +1768,6 @@ int main(int argc, char **argv)
     RUN(operations_of_a_net_are_its_multiply_adds);
     RUN(a_point_has_the_same_bits_in_every_batch);
     RUN(gradients_of_lone_points_are_finite_where_those_of_others_are);
-    RUN(points_put_in_order_are_all_there_and_neighbors_stand_together);
     RUN(a_dead_unit_that_is_left_out_changes_no_bit);
     RUN(the_order_of_units_in_memory_does_not_show);
     RUN(a_few_points_have_the_bits_of_many);

@@ -68,11 +68,11 @@ static void result_begin(result *r)
 }
 
 /* The smallest distance from the sphere along a pixel's ray, and where; places between pixels are welcome. */
-static double least_of(const double code[4], const disti_view *view, double x, double y, double p[3])
+static double least_of(const double code[4], const inside_view *view, double x, double y, double p[3])
 {
     double local[3], v[3], o[3], along = 0.0;
-    disti_view_direction(view, x, y, local);
-    disti_rotate_back(view->rotation, local, v);
+    inside_view_direction(view, x, y, local);
+    inside_rotate_back(view->rotation, local, v);
     for (int k = 0; k < 3; k++) along -= (view->center[k] - code[k]) * v[k];
     for (int k = 0; k < 3; k++) {
         p[k] = view->center[k] + along * v[k];
@@ -124,19 +124,20 @@ TEST(outline_seeds_are_what_the_equation_says)
         dist_camera camera = camera_at(SIDE, 0.4);
         dist_render_desc how = outline_how(2.0f * pixel_width(&camera));
         how.trace = paper ? DIST_TRACE_PAPER : DIST_TRACE_GUARDED;
-        disti_view view;
+        inside_view view;
         result got;
         int near_misses = 0;
-        disti_view_of(&camera, &view);
+        view = inside_view_of(&camera);
         dist_tape *tape = outline_backward(ctx, &field, &camera, &how, &got);
+        inside_tape kept = inside_tape_of(tape);
         for (int i = 0; i < PIXELS; i++) {
             double p[3], local[3], v[3], n[3], q[3], length = 0.0, t = 0.0;
-            disti_view_direction(&view, i % SIDE, i / SIDE, local);
-            disti_rotate_back(view.rotation, local, v);
-            if ((tape->status[i] & 15) != DIST_RAY_MISS || !(tape->status[i] & DISTI_TAPE_SAMPLE)) continue;
+            inside_view_direction(&view, i % SIDE, i / SIDE, local);
+            inside_rotate_back(view.rotation, local, v);
+            if (!inside_tape_missed(tape, (size_t)i)) continue;
             for (int k = 0; k < 3; k++) t -= view.center[k] * v[k];
             for (int k = 0; k < 3; k++) {
-                p[k] = paper ? (double)tape->sample[4 * i + 1 + k] : view.center[k] + (t + (double)tape->s[i]) * v[k];
+                p[k] = paper ? (double)kept.sample[4 * i + 1 + k] : view.center[k] + (t + (double)kept.s[i]) * v[k];
                 n[k] = p[k] - (double)code[k];
                 length += n[k] * n[k];
             }
@@ -147,7 +148,7 @@ TEST(outline_seeds_are_what_the_equation_says)
                 n[k] /= length;
                 p[k] = (double)code[k] + (double)code[3] * n[k];
             }
-            disti_rotate(view.rotation, p, q);
+            inside_rotate(view.rotation, p, q);
             for (int k = 0; k < 3; k++) q[k] += view.translation[k];
             double seed = weight_at(view.fx * q[0] / q[2] + view.cx, view.fy * q[1] / q[2] + view.cy, SIDE) *
                           (double)(sky[0] - paint[0]) / (double)how.relax_band;
@@ -160,7 +161,7 @@ TEST(outline_seeds_are_what_the_equation_says)
         CHECK(near_misses > 200);
         double size = fabs(expected[3]);
         for (int k = 0; k < 4; k++) CHECK_NEAR(expected[k], got.code[k], 1e-4 * size);
-        disti_rotate(view.rotation, pull, turned);
+        inside_rotate(view.rotation, pull, turned);
         for (int k = 0; k < 3; k++) CHECK_NEAR(-turned[k], got.translation[k], 1e-4 * size);
         dist_tape_destroy(tape);
         dist_context_destroy(ctx);
@@ -168,7 +169,7 @@ TEST(outline_seeds_are_what_the_equation_says)
 }
 
 /* Sum of weight x red over a picture of infinitely small pixels, per pixel of the given one. */
-static double covered(const double code[4], const disti_view *view, int side)
+static double covered(const double code[4], const inside_view *view, int side)
 {
     enum { FINE = 6 };
     double sum = 0.0, p[3];
@@ -194,21 +195,21 @@ TEST(outline_gradient_is_the_derivative_of_the_area_but_for_the_bands_width)
         dist_field field = flat_sphere(code);
         dist_camera camera = camera_at(side, 0.4);
         dist_render_desc how = outline_how(pixel_width(&camera));
-        disti_view view;
+        inside_view view;
         result got;
         double size = 0.0, worst = 0.0;
-        disti_view_of(&camera, &view);
+        view = inside_view_of(&camera);
         dist_tape_destroy(outline_backward(ctx, &field, &camera, &how, &got));
         for (int group = 0; group < 2; group++)
             for (int k = 0; k < (group ? 3 : 4); k++) { /* the code, the camera's translation */
                 double sides[2], minus[3];
                 for (int side_of = 0; side_of < 2; side_of++) {
-                    disti_view moved = view;
+                    inside_view moved = view;
                     double exact[4], step = side_of ? h : -h;
                     for (int j = 0; j < 4; j++) exact[j] = (double)code[j] + (!group && j == k ? step : 0.0);
                     if (group) moved.translation[k] += step;
                     for (int j = 0; j < 3; j++) minus[j] = -moved.translation[j];
-                    disti_rotate_back(moved.rotation, minus, moved.center);
+                    inside_rotate_back(moved.rotation, minus, moved.center);
                     sides[side_of] = covered(exact, &moved, side);
                 }
                 double expected = (sides[1] - sides[0]) / (2.0 * h);

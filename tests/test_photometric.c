@@ -23,14 +23,19 @@ typedef struct photo_pose {
     double rotation[9], translation[3];
 } photo_pose;
 
+static double dot(const double a[3], const double b[3])
+{
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+}
+
 static double plane_depth(const dist_camera *camera, double x, double y)
 {
-    disti_view view;
+    inside_view view;
     double ray[3], world[3], normal[3] = {0.2, -0.1, 1.0};
-    disti_view_of(camera, &view);
-    disti_view_direction(&view, x, y, ray);
-    disti_rotate_back(view.rotation, ray, world);
-    return -disti_dot(normal, view.center) / disti_dot(normal, world) * ray[2];
+    view = inside_view_of(camera);
+    inside_view_direction(&view, x, y, ray);
+    inside_rotate_back(view.rotation, ray, world);
+    return -dot(normal, view.center) / dot(normal, world) * ray[2];
 }
 
 static void photo_fill(photo_case *c, uint64_t seed)
@@ -63,9 +68,9 @@ static void photo_fill(photo_case *c, uint64_t seed)
 
 static photo_pose pose_of(const dist_camera *camera)
 {
-    disti_view view;
+    inside_view view;
     photo_pose pose;
-    disti_view_of(camera, &view);
+    view = inside_view_of(camera);
     memcpy(pose.rotation, view.rotation, sizeof pose.rotation);
     memcpy(pose.translation, view.translation, sizeof pose.translation);
     return pose;
@@ -100,8 +105,8 @@ static double photo_reference(const photo_case *c, const double *depth, const ph
         double seen[3] = {x * depth[i], y * depth[i], depth[i]};
         if (!c->mask_to[i] || !(depth[i] > 0 && depth[i] < 1e5)) continue;
         for (int k = 0; k < 3; k++) s[k] = seen[k] - poses[0].translation[k];
-        disti_rotate_back(poses[0].rotation, s, p);
-        disti_rotate(poses[1].rotation, p, q);
+        inside_rotate_back(poses[0].rotation, s, p);
+        inside_rotate(poses[1].rotation, p, q);
         for (int k = 0; k < 3; k++) q[k] += poses[1].translation[k];
         if (q[2] <= 0) continue;
         double u = ((double)b->fx * q[0] + (double)b->skew * q[1]) / q[2] + (double)b->cx - (double)b->pixel_center;

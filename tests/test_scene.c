@@ -213,10 +213,11 @@ static void random_points(test_random *random, int n, double size, float *points
 static void near_points(test_random *random, const world *w, int n, double reach, float *points)
 {
     for (int i = 0; i < n; i++) {
-        const disti_ball *ball = &w->scene->ball[i % w->count];
-        float u[3], r = ball->radius * test_random_float(random, 0, (float)reach);
+        float ball[4], u[3];
+        inside_ball(w->scene, i % w->count, ball);
+        float r = ball[3] * test_random_float(random, 0, (float)reach);
         test_random_direction(random, u);
-        for (int k = 0; k < 3; k++) points[3 * i + k] = ball->center[k] + r * u[k];
+        for (int k = 0; k < 3; k++) points[3 * i + k] = ball[k] + r * u[k];
     }
 }
 
@@ -277,7 +278,8 @@ static void watched_eval(void *user, int worker, size_t n, const float *points, 
         double p[3] = {(double)points[3 * i], (double)points[3 * i + 1], (double)points[3 * i + 2]};
         x->farthest = fmax(x->farthest, sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2]));
     }
-    disti_sphere_eval(x->numbers, worker, n, points, sdf, gradient);
+    dist_field sphere = dist_field_sphere(x->numbers);
+    sphere.eval_fn(sphere.user, worker, n, points, sdf, gradient);
 }
 
 TEST(no_field_is_asked_outside_its_sphere)
@@ -721,21 +723,13 @@ static void union_eval(void *user, int worker, size_t n, const float *points, fl
         float best = 3e38f;
         for (int k = 0; k < w->count; k++) {
             const part *a = &w->part[k];
-            float f, ask[3], g[3], turned[3];
-            disti_placed placed;
-            memset(&placed, 0, sizeof placed);
-            placed.field = a->field;
-            placed.scale = a->placement.scale;
-            placed.inverse = 1.0f / placed.scale;
-            memcpy(placed.rotation, a->placement.rotation, sizeof placed.rotation);
-            memcpy(placed.translation, a->placement.translation, sizeof placed.translation);
-            float d = disti_ball_distance(&w->scene->ball[k], points + 3 * i);
-            disti_placed_local(&placed, points + 3 * i, d > 0.0f, ask);
+            const float *rotation = a->placement.rotation;
+            float f, ask[3], g[3], turned[3], d = inside_local(w->scene, k, points + 3 * i, ask);
             a->field.eval_fn(a->field.user, worker, 1, ask, &f, g);
             for (int axis = 0; axis < 3; axis++)
-                turned[axis] = placed.rotation[3 * axis] * g[0] + placed.rotation[3 * axis + 1] * g[1] +
-                               placed.rotation[3 * axis + 2] * g[2];
-            f *= placed.scale;
+                turned[axis] = rotation[3 * axis] * g[0] + rotation[3 * axis + 1] * g[1] +
+                               rotation[3 * axis + 2] * g[2];
+            f *= a->placement.scale;
             if (d > 0.0f) f = sqrtf(d * d + fmaxf(f, 0.0f) * fmaxf(f, 0.0f));
             if (f >= best) continue;
             best = f;
@@ -1223,7 +1217,7 @@ TEST(moving_a_placement_keeps_it_a_similarity)
     }
     double m[9], determinant;
     for (int i = 0; i < 9; i++) m[i] = (double)s.rotation[i];
-    CHECK_NEAR(0, disti_rotation_off(m, &determinant), 1e-6);
+    CHECK_NEAR(0, inside_rotation_off(m, &determinant), 1e-6);
     CHECK_NEAR(1, determinant, 1e-6);
     CHECK_NEAR(1, (double)s.scale / exp(logarithm), 1e-4);
     float step[7] = {0};
@@ -1455,7 +1449,7 @@ TEST(what_is_not_finite_stays_so)
     for (int with = 0; with < 2; with++) {
         CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &all, 4, points, sdf, with ? gradient : NULL), ctx);
         CHECK_NEAR(-0.5, sdf[0], 1e-6);
-        for (int i = 1; i < 4; i++) CHECK(!disti_finite(sdf[i]));
+        for (int i = 1; i < 4; i++) CHECK(!test_finite((double)sdf[i]));
     }
     dist_scene_destroy(scene);
     dist_context_destroy(ctx);

@@ -840,7 +840,7 @@ TEST(row_21_sine_networks)
             float x = test_random_float(&r, -20, 20), slope = 0;
             double angle = omegas[k] * (double)x, exact = sin(angle);
             double ulp = ldexp(1, ilogb(fmax(fabs(exact), 1e-30)) - 23);
-            double got = (double)disti_activate_one(DIST_ACTIVATION_SINE, (float)omegas[k], x, &slope);
+            double got = (double)inside_activate(DIST_ACTIVATION_SINE, (float)omegas[k], x, &slope);
             worst = fmax(worst, fabs(got - exact) / ulp);
             exact = omegas[k] * cos(angle);
             ulp = ldexp(1, ilogb(fmax(fabs(exact), 1e-30)) - 23);
@@ -851,7 +851,7 @@ TEST(row_21_sine_networks)
         for (int j = -20000; j < 20000; j++) { /* where sine or slope is largest, and far out */
             float x = (float)(1.57079632679489661923 * (double)j / omegas[k]), slope = 0;
             for (int far = 0; far < 2; far++, x *= 1e4f) {
-                double v = (double)disti_activate_one(DIST_ACTIVATION_SINE, (float)omegas[k], x, &slope);
+                double v = (double)inside_activate(DIST_ACTIVATION_SINE, (float)omegas[k], x, &slope);
                 worst = fmax(worst, fmax(fabs(v), fabs((double)slope) / omegas[k]));
             }
         }
@@ -862,9 +862,9 @@ TEST(row_21_sine_networks)
     }
     double worst = 0;
     for (float x = -40; x <= 40; x += 0.01f) { /* saturated either way, softplus bends as exp(-|2 x|) does */
-        float slope = 0, v = disti_activate_one(DIST_ACTIVATION_SOFTPLUS, 2, x, &slope);
+        float slope = 0, v = inside_activate(DIST_ACTIVATION_SOFTPLUS, 2, x, &slope);
         double e = exp(-2 * fabs((double)x)), exact = 2 * e / (1 + e) / (1 + e);
-        worst = fmax(worst, fabs((double)disti_curvature(DIST_ACTIVATION_SOFTPLUS, 2, v, slope) / exact - 1));
+        worst = fmax(worst, fabs((double)inside_curvature(DIST_ACTIVATION_SOFTPLUS, 2, v, slope) / exact - 1));
     }
     SAY(worst <= 2e-5, "softplus'' to 40 and -40, relative", "2e-5", worst);
     dist_context_destroy(ctx);
@@ -1345,15 +1345,10 @@ TEST(row_33_secant_with_equal_ends)
     SAY(test_finite((double)hit.error) && test_finite((double)hit.distance), "error of a flat hit", "finite",
         hit.error);
     /* found by random scenes: f = 0 at both ends of a bracket, 0 / 0 */
-    disti_tracer tracer;
-    disti_ray ray;
+    float best = 0;
     dist_field field = shape_field(&stairs, 1, 1);
-    CHECK_STATUS(DIST_OK, disti_tracer_init(&tracer, ctx, &field, NULL, "test"), ctx);
-    memset(&ray, 0, sizeof ray);
-    const disti_sample from = {0.1f, 0}, to = {0.2f, 0};
-    for (int i = disti_ray_open_bracket(&tracer, &ray, from, to); i; i = disti_ray_advance(&tracer, &ray, 0)) {}
-    SAY(ray.best >= 0.1f && ray.best <= 0.2f && ray.status == DIST_RAY_HIT, "bracket of zeros: s", "0.1 to 0.2",
-        ray.best);
+    int status = inside_bracket_of_zeros(ctx, &field, 0.1f, 0.2f, &best);
+    SAY(best >= 0.1f && best <= 0.2f && status == DIST_RAY_HIT, "bracket of zeros: s", "0.1 to 0.2", best);
     dist_context_destroy(ctx);
 }
 

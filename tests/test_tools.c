@@ -17,6 +17,11 @@ static int blocked(const dist_hit *hit)
     return hit->status == DIST_RAY_HIT;
 }
 
+static float length_of(const float *v)
+{
+    return sqrtf(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]);
+}
+
 TEST(any_hit_finds_a_blocker_where_there_is_one_for_fewer_queries)
 {
     dist_context *ctx = shape_context();
@@ -76,7 +81,7 @@ TEST(a_ray_looks_as_far_as_it_is_told_in_lengths_of_its_direction)
             how.any_hit = both;
             CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, RAYS, origins, directions, &how, any, &second), ctx);
             for (int i = 0; i < RAYS; i++) {
-                float length = disti_length(directions[3 * i], directions[3 * i + 1], directions[3 * i + 2]);
+                float length = length_of(directions + 3 * i);
                 float off = nearest[i].distance - 0.8f * length;
                 if (!blocked(&nearest[i])) {
                     wrong += blocked(&any[i]);
@@ -480,7 +485,7 @@ static double surface_sample(const dist_field *field, dist_context *ctx, float *
     }
     dist_trace(ctx, field, RAYS, origins, directions, NULL, nearest, NULL);
     for (int i = 0; i < RAYS; i++) {
-        float length = disti_length(directions[3 * i], directions[3 * i + 1], directions[3 * i + 2]);
+        float length = length_of(directions + 3 * i);
         if (!blocked(&nearest[i])) continue;
         for (int k = 0; k < 3; k++)
             surface[3 * *count + k] = origins[3 * i + k] + nearest[i].distance / length * directions[3 * i + k];
@@ -699,7 +704,7 @@ TEST(what_decoders_say_far_off_leads_to_the_nearest_part_all_the_same)
 static void flat_eval(void *user, int worker, size_t n, const float *at, float *sdf, float *gradient)
 {
     const dist_field *field = (const dist_field *)user;
-    asked += !disti_finite_all(3 * n, at);
+    asked += !test_finite_all(3 * n, at);
     field->eval_fn(field->user, worker, n, at, sdf, gradient);
     for (size_t i = 0; i < n; i++) {
         if (sdf[i] > 0) continue;
@@ -1094,7 +1099,7 @@ TEST(what_has_no_answer_says_so)
     dist_field field = shape_field(&shapes[0], 1, 1);
     CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &field, 1, p, closest, distance, status), ctx);
     CHECK_EQUAL(DIST_RAY_UNRESOLVED, status[0]);
-    CHECK(disti_finite_all(3, closest));
+    CHECK(test_finite_all(3, closest));
     CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &field, 1, p, closest, NULL, NULL), ctx);
     field = shape_field(&shapes[1], 1, 1);
     CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &field, 1, p + 4, closest, distance, status), ctx);
@@ -1223,8 +1228,9 @@ TEST(no_f_leads_beyond_the_sphere)
         CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &field, 2, spheres, closest, distance, status), ctx);
         CHECK_STATUS(DIST_OK, dist_field_collide(ctx, &field, 2, spheres, contacts), ctx);
         CHECK_EQUAL(0, beyond);
-        CHECK(disti_finite_all(6, closest) && disti_finite_all(2, distance));
-        for (int i = 0; i < 2; i++) CHECK(disti_finite_all(3, contacts[i].point) && disti_finite(contacts[i].depth));
+        CHECK(test_finite_all(6, closest) && test_finite_all(2, distance));
+        for (int i = 0; i < 2; i++)
+            CHECK(test_finite_all(3, contacts[i].point) && test_finite((double)contacts[i].depth));
     }
     dist_context_destroy(ctx);
 }
@@ -1255,7 +1261,7 @@ TEST(many_points_are_the_same_as_single_ones)
     CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &field, N, points, closest, distance, status), ctx);
     for (int i = 0; i < N; i += 37) {
         float d;
-        test_soil(ctx, i & 1 ? 0 : 0xff);
+        inside_soil(ctx, i & 1 ? 0 : 0xff);
         CHECK_STATUS(DIST_OK, dist_field_closest_point(ctx, &field, 1, points + 3 * i, alone, &d, NULL), ctx);
         CHECK_BYTES(sizeof alone, closest + 3 * i, alone);
         CHECK_BYTES(sizeof d, distance + i, &d);

@@ -668,7 +668,7 @@ static int scene_render(const scene *s, stage *where, planes *p, pulls *g, scene
         if (m.shape) dist_shape_set_code(m.shape, code);
         own->code[0] = s->own.code[0] + 1e-3f * (float)k * (float)s->radius;
         out = planes_of(p, s->planes, m.placed.color_fn != NULL);
-        test_soil(ctx, soil);
+        inside_soil(ctx, soil);
         dist_render(ctx, &m.placed, &before, &how, &out, tape);
     }
     if (s->warm && m.shape && dist_context_status(ctx) == DIST_OK) {
@@ -679,10 +679,10 @@ static int scene_render(const scene *s, stage *where, planes *p, pulls *g, scene
     own->code[0] = s->own.code[0];
     own->points = 0;
     out = planes_of(p, s->planes, m.placed.color_fn != NULL);
-    test_soil(ctx, soil);
+    inside_soil(ctx, soil);
     dist_status status = dist_render(ctx, &m.placed, &camera, &how, &out, tape);
     if (status == DIST_OK) status = dist_context_status(ctx); /* a warm picture may be refused */
-    test_soil(ctx, soil);
+    inside_soil(ctx, soil);
     if (status == DIST_OK && tape) status = scene_backward(s, ctx, &m.placed, tape, &out, g);
     if (where->memory.requests != requests) note(MEMORY, "requests", (double)requests, (double)where->memory.requests);
     if (status != DIST_OK && !strstr(dist_context_message(ctx), ": ")) note(REFUSED, "status", status, 0);
@@ -990,21 +990,21 @@ static void answers_of(dist_context *ctx, const dist_field *field, size_t n, int
     memset(&grads, 0, sizeof grads);
     memset(&desc, 0, sizeof desc);
     if (field->code_size > 0) grads.code = a->d_code;
-    test_soil(ctx, soil);
+    inside_soil(ctx, soil);
     dist_field_eval(ctx, field, n, points, a->sdf, a->gradient);
-    test_soil(ctx, soil);
+    inside_soil(ctx, soil);
     dist_field_backward(ctx, field, n, points, spheres, NULL, NULL, a->d_points, &grads);
-    test_soil(ctx, soil);
+    inside_soil(ctx, soil);
     dist_field_closest_point(ctx, field, n, points, a->closest, a->distance, a->status);
-    test_soil(ctx, soil);
+    inside_soil(ctx, soil);
     dist_field_collide(ctx, field, n, spheres, a->contacts);
-    test_soil(ctx, soil);
+    inside_soil(ctx, soil);
     dist_trace(ctx, field, n, points, directions, NULL, a->hits, NULL);
     if (n > 1) return;
     desc.resolution = 12;
     desc.normals = 1;
     desc.refine = 1;
-    test_soil(ctx, soil);
+    inside_soil(ctx, soil);
     dist_mesh *mesh = dist_mesh_extract(ctx, field, &desc);
     if (!mesh) return;
     a->vertices = mesh->vertex_count;

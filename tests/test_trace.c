@@ -1957,70 +1957,6 @@ TEST(certified_pictures_of_nets_miss_nothing)
     dist_context_destroy(ctx);
 }
 
-static disti_sample sample(float s, float f)
-{
-    disti_sample made = {s, f};
-    return made;
-}
-
-/* What rays of decoders met: f came down at a slope that foretold a crossing half way to where it crossed again; kept a
-   height of 0.7 epsilon for 17 times as far as its slope said; and crossed 0 at .23 of a coarse bracket, not at .1. */
-TEST(bounds_reach_to_where_f_was_foretold_to_cross_and_over_what_is_flat)
-{
-    dist_context *ctx = shape_context();
-    test_shape shape = shape_make(SHAPE_SPHERE, 0.8, 0, 0, 0);
-    dist_field field = shape_field(&shape, 1, 1);
-    disti_tracer tracer;
-    disti_ray ray;
-    for (int certified = 0; certified < 2; certified++) {
-        dist_render_desc how = plain_how();
-        how.certified = certified;
-        CHECK_STATUS(DIST_OK, disti_tracer_init(&tracer, ctx, &field, &how, "test"), ctx);
-        memset(&ray, 0, sizeof ray);
-        ray.sign = 1;
-        ray.known = 1;
-        ray.slope = -0.4373f;
-        CHECK(disti_ray_open_bracket(&tracer, &ray, sample(0, 5.211e-3f), sample(2.34e-2f, -5e-7f)));
-        CHECK_EQUAL(0, disti_ray_bracketed(&tracer, &ray, sample(ray.q, -1.3e-6f)));
-        CHECK_EQUAL(DIST_RAY_HIT, ray.status);
-        CHECK(ray.error > (certified ? 1.8e-2f : 9.3e-3f)); /* was 2e-5; so much of it is not proven to be empty */
-    }
-    tracer.how.certified = 1;
-    CHECK(disti_ray_open_bracket(&tracer, &ray, sample(0, 5.211e-3f), sample(5.2115e-3f, -5e-7f))); /* but this is */
-    CHECK_EQUAL(0, disti_ray_bracketed(&tracer, &ray, sample(ray.q, 5.211e-3f - ray.q)));
-    CHECK(ray.error < 1e-5f);
-    /* as short as two epsilons */
-    CHECK_EQUAL(0, disti_ray_open_bracket(&tracer, &ray, sample(0, 3e-5f), sample(9e-5f, -3e-5f)));
-    CHECK_EQUAL(DIST_RAY_HIT, ray.status);
-    CHECK_NEAR(4.5e-5, ray.best, 1e-9);
-    CHECK_NEAR(9e-5, ray.error, 1e-9);
-    CHECK(disti_ray_alone(&tracer, &ray, sample(0, 0.1f), sample(0.5f, -0.5f), 0));
-    tracer.far = 0.1f; /* twice as steep where |f| is larger: 0.5 is at least 0.3 deep, not 0.5 */
-    tracer.ratio = 0.5f;
-    CHECK(!disti_ray_alone(&tracer, &ray, sample(0, 0.1f), sample(0.5f, -0.5f), 0));
-    CHECK_STATUS(DIST_OK, disti_tracer_init(&tracer, ctx, &field, NULL, "test"), ctx);
-    memset(&ray, 0, sizeof ray);
-    ray.sign = 1;
-    ray.base = 2;
-    ray.leave = 0.5f;
-    ray.a.f = 3e38f;
-    ray.incline = -0.4686f;
-    ray.width = 4;
-    CHECK_EQUAL(0, disti_ray_predicted(&tracer, &ray, sample(ray.q, 3.572e-5f)));
-    CHECK_EQUAL(DIST_RAY_HIT, ray.status);
-    CHECK(ray.error > 1.28e-3f && ray.error < 2e-3f);
-    dist_render_desc how = plain_how();
-    how.epsilon = 1e-2f;
-    CHECK_STATUS(DIST_OK, disti_tracer_init(&tracer, ctx, &field, &how, "test"), ctx);
-    memset(&ray, 0, sizeof ray);
-    ray.sign = 1;
-    ray.slope = -1;
-    CHECK_EQUAL(0, disti_ray_open_bracket(&tracer, &ray, sample(0, 4e-4f), sample(4e-3f, -3.6e-3f)));
-    CHECK_EQUAL(DIST_RAY_HIT, ray.status);
-    CHECK(ray.error > 1.1e-3f && ray.error < 2.1e-3f); /* was 8e-4 */
-    dist_context_destroy(ctx);
-}
-
 /* The second picture on a tape begins with the tiles that cost most in the first; whoever traces them, whenever, the
    picture is the same. */
 TEST(tiles_that_cost_most_last_time_come_first_and_change_nothing)
@@ -2045,13 +1981,14 @@ TEST(tiles_that_cost_most_last_time_come_first_and_change_nothing)
             out.depth = depth[k == 0 ? 0 : 1 + turn];
             CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, tape), ctx);
         }
-        int tiles = ((WIDTH - 1) / tape->tiled + 1) * ((HEIGHT - 1) / tape->tiled + 1), seen = 0;
-        unsigned most = k == 1 ? tape->cost[tape->order[0]] : 0, last = most;
+        inside_tape kept = inside_tape_of(tape);
+        int tiles = ((WIDTH - 1) / kept.tiled + 1) * ((HEIGHT - 1) / kept.tiled + 1), seen = 0;
+        unsigned most = k == 1 ? kept.cost[kept.order[0]] : 0, last = most;
         for (int i = 0; k == 1 && i < tiles; i++) {
-            unsigned cost = tape->cost[tape->order[i]];
+            unsigned cost = kept.cost[kept.order[i]];
             CHECK(cost <= last + most / 60);
             last = cost;
-            for (int j = 0; j < tiles; j++) seen += tape->order[j] == i;
+            for (int j = 0; j < tiles; j++) seen += kept.order[j] == i;
         }
         CHECK(k == 0 || (tiles > 8 && seen == tiles && most > 0 && last < most / 2));
         dist_tape_destroy(tape);
@@ -2059,167 +1996,6 @@ TEST(tiles_that_cost_most_last_time_come_first_and_change_nothing)
     }
     CHECK_BYTES(sizeof depth[0], depth[0], depth[1]);
     CHECK_BYTES(sizeof depth[0], depth[0], depth[2]);
-}
-
-/* What rays of decoders went through: a jump by two samples ended where f was 3e-5, not .0075 as foretold, behind a
-   wall; one ended at about what was foretold, but from there f rose as from a crossing before it. A sample that a jump
-   brought, and the check took back, is where the bracket begins: f was flat from there on. */
-TEST(steps_that_may_have_gone_through_something_are_taken_back)
-{
-    dist_context *ctx = shape_context();
-    test_shape shape = shape_make(SHAPE_SPHERE, 0.8, 0, 0, 0);
-    dist_field field = shape_field(&shape, 1, 1.125);
-    dist_render_desc how = plain_how();
-    disti_tracer tracer;
-    disti_ray ray;
-    CHECK_STATUS(DIST_OK, disti_tracer_init(&tracer, ctx, &field, &how, "test"), ctx);
-    memset(&ray, 0, sizeof ray);
-    ray.sign = ray.leave = 1;
-    ray.base = 2;
-    ray.known = 1;
-    ray.mode = DISTI_JUMP;
-    ray.front.s = 0.25487f;
-    ray.front.f = 3.8564e-2f;
-    ray.slope = -0.2855f;
-    CHECK(!disti_ray_trusts(&tracer, &ray, 3.4974e-5f, 0.108897f));
-    CHECK(disti_ray_trusts(&tracer, &ray, 3.7e-3f, 0.108897f));
-    ray.a.s = 0.341199f;
-    ray.a.f = 2.388e-2f;
-    ray.front.s = 0.404929f;
-    ray.front.f = 1.0003e-2f;
-    ray.slope = -0.2178f;
-    ray.q = 0.431654f;
-    CHECK(disti_ray_doubts(&tracer, &ray, 2.4429e-2f, ray.q - ray.front.s));
-    CHECK(!disti_ray_doubts(&tracer, &ray, 1.2e-2f, ray.q - ray.front.s)); /* so gently, f was above 0 all the way */
-    CHECK_EQUAL(1, disti_ray_advance(&tracer, &ray, 2.4429e-2f));
-    CHECK_NEAR(0.341199, ray.front.s, 1e-6);
-    CHECK_NEAR(0.404929, ray.b.s, 1e-6);
-    CHECK(ray.q > ray.front.s && ray.q < ray.b.s && ray.mode == DISTI_MARCH);
-    tracer.how.certified = 1;
-    ray.a.f = 2.388e-2f;
-    CHECK(!disti_ray_doubts(&tracer, &ray, 2.4429e-2f, 0.0267f)); /* nothing was trusted there */
-    tracer.how.certified = 0;
-    memset(&ray, 0, sizeof ray);
-    ray.sign = 1;
-    ray.known = 1;
-    ray.slope = -0.7227f;
-    ray.best = 8.1e-3f;
-    ray.fbest = 2.3094e-4f;
-    ray.mode = DISTI_JUMP;
-    CHECK_EQUAL(1, disti_ray_open_bracket(&tracer, &ray, sample(0, 8.2277e-3f), sample(3.03e-2f, -7.0323e-3f)));
-    CHECK(ray.a.s > 8e-3f && ray.a.f < 2.4e-4f && ray.target > 2e-2f);
-    ray.mode = DISTI_BACK; /* warm start: best is of another picture */
-    CHECK_EQUAL(1, disti_ray_open_bracket(&tracer, &ray, sample(0, 8.2277e-3f), sample(3.03e-2f, -7.0323e-3f)));
-    CHECK_NEAR(0, ray.a.s, 0);
-    for (int skips = 0; skips < 2; skips++) { /* along ripples of f, or past spheres to f = 0: from there on, or... */
-        memset(&ray, 0, sizeof ray);
-        ray.sign = ray.leave = 1;
-        ray.known = 1;
-        ray.mode = skips ? DISTI_SKIP : DISTI_MARCH;
-        ray.base = 2;
-        ray.footprint = 1e-3f;
-        ray.front.s = 0.1739f;
-        ray.front.f = 1.652e-4f;
-        ray.slope = -0.087f;
-        ray.q = skips ? 0.18f : 0.1756f;
-        CHECK_EQUAL(1, disti_ray_advance(&tracer, &ray, skips ? 4e-6f : 1.82e-5f));
-        CHECK_NEAR(0.1739, ray.crept.s, 1e-6);
-        ray.a.s = 0.1759f;
-        ray.b.s = 0.176f;
-        ray.a.f = 1e-5f;
-        ray.b.f = -2e-5f;
-        ray.incline = -0.3f;
-        ray.target = 0;
-        CHECK_NEAR(0.176 - 0.1739, disti_ray_kink(&tracer, &ray, 0.35f), 1e-6);
-        CHECK(disti_ray_kink(&tracer, &ray, 0.15f) < 1e-4f); /* but not where f falls as it did all the way, */
-        disti_ray_creeps(&tracer, &ray, sample(ray.q, 6e-4f), 0);
-        CHECK(disti_ray_kink(&tracer, &ray, 0.35f) < 1e-4f); /* or has been well above 0 since */
-        tracer.how.certified = 1;
-        disti_ray_creeps(&tracer, &ray, sample(ray.q, 1e-5f), 1);
-        CHECK(!(ray.crept.f > 0)); /* nothing was trusted */
-        tracer.how.certified = 0;
-    }
-    for (int coarse = 0; coarse < 2; coarse++) { /* foretold was f = 0; hardly less than at the front, it is flat */
-        for (int fell = 0; fell < 2; fell++) {
-            how.epsilon = coarse ? 1e-2f : 1e-3f;
-            CHECK_STATUS(DIST_OK, disti_tracer_init(&tracer, ctx, &field, &how, "test"), ctx);
-            memset(&ray, 0, sizeof ray);
-            ray.sign = 1;
-            ray.base = 2;
-            ray.leave = 0.5f;
-            ray.front.f = fell ? 5.4e-2f : 5.54e-4f;
-            ray.a.f = 3e38f;
-            ray.q = 9.4e-4f;
-            ray.incline = -0.889f;
-            ray.width = 4;
-            CHECK_EQUAL(fell ? 0 : 1, disti_ray_predicted(&tracer, &ray, sample(ray.q, 5.39e-4f)));
-            CHECK(fell || (ray.mode != DISTI_PREDICT && ray.mode != DISTI_DONE));
-            CHECK(!fell || (ray.error >= 0.75f * how.epsilon && ray.error < how.epsilon + 5e-3f)); /* of one sample */
-        }
-    }
-    dist_context_destroy(ctx);
-}
-
-/* Pixels of the lattice of 8 were not predicted, (4, y) from 4 pixels away, (2, y) and (6, y) from 2, all others from
-   next to them. */
-TEST(what_neighbors_were_off_counts_by_the_distance_they_were_predicted_from)
-{
-    disti_ray before, behind;
-    disti_guess guess;
-    memset(&before, 0, sizeof before);
-    memset(&behind, 0, sizeof behind);
-    memset(&guess, 0, sizeof guess);
-    before.off = 3e-4f;
-    disti_guess_off(&guess, &before, &behind, DISTI_LATTICE, 3, 2, 1);
-    CHECK(!(guess.off > 0)); /* nothing is known of (4, 2), so nothing of (3, 2) */
-    behind.off = 8e-4f;
-    disti_guess_off(&guess, &before, &behind, DISTI_LATTICE, 3, 0, 1); /* (2, 0) from 2, (4, 0) from 4 pixels away */
-    CHECK_NEAR(2e-4, guess.off, 1e-9);
-    CHECK_NEAR(8e-4, guess.seen, 1e-9);
-    /* (4, 0); (8, 0) is of the lattice, whatever its ray says */
-    disti_guess_off(&guess, &before, &behind, DISTI_LATTICE, 6, 0, 2);
-    CHECK_NEAR(1.5e-4, guess.off, 1e-9);
-    CHECK_NEAR(3e-4, guess.seen, 1e-9);
-    /* (16, 24) is of it, too; (18, 24) speaks for both */
-    disti_guess_off(&guess, &before, &behind, DISTI_LATTICE, 17, 24, 1);
-    CHECK_NEAR(4e-4, guess.off, 1e-9);
-    disti_guess_off(&guess, &before, &behind, DISTI_LATTICE, 5, 7, 1); /* (4, 7) and (6, 7): from next to them */
-    CHECK_NEAR(8e-4, guess.off, 1e-9);
-    behind.kept = 1;
-    disti_guess_off(&guess, &before, &behind, DISTI_LATTICE, 3, 0, 1); /* a warm start's */
-    CHECK_NEAR(8e-4, guess.off, 1e-9);
-    memset(&guess, 0, sizeof guess);
-    behind.kept = 0;
-    disti_guess_off(&guess, &before, &behind, DISTI_LATTICE, 4, 0, 4); /* both of the lattice */
-    CHECK(!(guess.off > 0) && !(guess.seen > 0));
-}
-
-/* A step of Newton's along a slope of a quarter from a positive sample ends a ray only if the sample is within epsilon;
-   along a steeper one the step may be twelve of them long. */
-TEST(flat_rays_end_at_samples_within_epsilon)
-{
-    dist_context *ctx = shape_context();
-    test_shape shape = shape_make(SHAPE_TORUS, 0.6, 0.25, 0, 0);
-    dist_field field = shape_field(&shape, 1, 1);
-    dist_render_desc how = plain_how();
-    how.epsilon = 1e-4f;
-    for (int k = 0; k < 8; k++) {
-        disti_tracer tracer;
-        disti_ray ray;
-        float slope = k & 1 ? -0.25f : -0.5f, f = k & 2 ? 2.5e-4f : 9e-5f, sign = k & 4 ? -1.0f : 1.0f;
-        CHECK_STATUS(DIST_OK, disti_tracer_init(&tracer, ctx, &field, &how, "test"), ctx);
-        memset(&ray, 0, sizeof ray);
-        ray.sign = 1;
-        ray.base = 2;
-        ray.leave = 0.5f;
-        ray.front.f = 0.01f;
-        ray.front.s = -0.02f;
-        ray.a.s = -3e-3f;
-        ray.a.f = sign * f - 3e-3f * slope; /* the slope of the last two samples */
-        CHECK_EQUAL(k == 3 ? 1 : 0, disti_ray_predicted(&tracer, &ray, sample(ray.q, sign * f)));
-        CHECK(k == 3 || ray.status == DIST_RAY_HIT);
-    }
-    dist_context_destroy(ctx);
 }
 
 /* Against rays that step by at most f / 2.5. */
@@ -2401,7 +2177,7 @@ TEST(tiles_go_outward_and_none_is_left_out)
             char seen[81] = {0};
             int n = across * down, ring = 99, bad = 0;
             for (int i = 0; i < n; i++) {
-                int tile = disti_tile_outward(across, down, i), x = tile % across, y = tile / across;
+                int tile = inside_tile_outward(across, down, i), x = tile % across, y = tile / across;
                 if (tile < 0 || tile >= n || seen[tile]++) {
                     bad++;
                     continue;
@@ -2541,11 +2317,7 @@ int main(int argc, char **argv)
     RUN(no_error_is_below_0);
     RUN(certified_rays_out_of_steps_are_on_no_plateau);
     RUN(certified_pictures_of_nets_miss_nothing);
-    RUN(bounds_reach_to_where_f_was_foretold_to_cross_and_over_what_is_flat);
     RUN(tiles_that_cost_most_last_time_come_first_and_change_nothing);
-    RUN(steps_that_may_have_gone_through_something_are_taken_back);
-    RUN(what_neighbors_were_off_counts_by_the_distance_they_were_predicted_from);
-    RUN(flat_rays_end_at_samples_within_epsilon);
     RUN(the_default_tracer_loses_one_hit_in_ten_thousand_of_the_embedded_family);
     RUN(error_bounds_hold_for_999_hits_of_1000);
     RUN(error_bounds_hold_for_999_hits_of_1000_of_real_decoders);

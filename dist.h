@@ -227,7 +227,9 @@ typedef struct dist_field {
        DIST_TRACE_PAPER and, in the corners of its cube, dist_mesh_extract */
     float center[3];
     float radius;    /* 1e-15 to 1e15 */
-    float lipschitz;        /* bound or estimate of |grad f| where 0 < f < lipschitz_within; 0: 1 */
+    /* bound or estimate of |grad f| where 0 < f < lipschitz_within. 0: 1, as distances have it: of a field of your own
+       that is steeper much of the surface, or all, is stepped over. stats.steepest tells of it */
+    float lipschitz;
     float lipschitz_within; /* 0: clamp / 2; without a clamp radius / 20 */
     float lipschitz_far;    /* the same where f is larger; 0: lipschitz */
     /* how.certified goes by these where they are larger than the two before, which may be those of most places: of a
@@ -252,14 +254,12 @@ typedef struct dist_field {
        the scene's. Set by dist_shape_field and dist_scene_field; NULL: nobody else's */
     const void *weights_of, *color_weights_of;
     dist_context *owner; /* the context that made it; NULL: any */
-    /* a number that changes with what user points to, so that a cache of what it was is refused. Set by
+    /* a number that goes by what user points to, so that a cache or a tape of what it was is refused. Set by
        dist_shape_field and dist_scene_field, whose functions give 0 where eval_fn is not theirs any more; NULL: that is
        not looked at */
     unsigned (*changes_fn)(const struct dist_field *field);
-    /* since the field was taken, bit 0: the shape, or one of the scene's, has got another texture, so its color is
-       refused (0 where color_fn is not theirs any more); bit 1: the scene's weights have become more or fewer, so their
-       gradient is. Set likewise; NULL: that is not looked at */
-    int (*stale_fn)(const struct dist_field *field);
+    /* what is out of date, of the DISTI_STALE_* bits asked for: then it is refused. Set likewise */
+    int (*stale_fn)(const struct dist_field *field, int what);
     unsigned textures; /* how often it had got one then */
     const struct dist_cache *cache; /* set by dist_cache_field; NULL: none */
 } dist_field;
@@ -454,13 +454,13 @@ typedef struct dist_net_desc {
                          softplus only, of that best where scale * bound is some 30 or more (f grows slower than the
                          distance then: by half of it at 100). Fourier levels have no share in it. 0: PyTorch's start */
     float bound;      /* radius of the sphere that holds the shape, 1e-6 to 1e6; 0: 1 */
-    float clamp;      /* 0: 0.1 with a code, none without one or of a texture */
+    float clamp;      /* 0: 0.1 with a code, none without one or of a texture; below 0: none */
     unsigned seed;
 } dist_net_desc;
 DIST_API dist_net *dist_net_create(dist_context *ctx, const dist_net_desc *desc);
 /* Replace all weights (dist_net_weight_count) or one stored code. The caller sees to it that no shape is in use by
-   another thread. After new weights each shape of the net wants dist_shape_set_code before it is used again: until then
-   it has the new weights beside biases with its code and the old ones folded in, which is no function of either. */
+   another thread. After new weights each shape of the net wants dist_shape_set_code before it is used again, and is
+   refused until then: it would have the new weights beside biases with its code and the old ones folded in. */
 DIST_API dist_status dist_net_set_weights(dist_context *ctx, dist_net *net, const float *weights);
 DIST_API dist_status dist_net_set_code(dist_context *ctx, dist_net *net, int index, const float *code);
 #endif
@@ -469,9 +469,9 @@ DIST_API dist_status dist_net_set_code(dist_context *ctx, dist_net *net, int ind
    is borrowed until the shape is destroyed. */
 DIST_API dist_shape *dist_shape_create(dist_context *ctx, const dist_net *net, const float *code);
 DIST_API void dist_shape_destroy(dist_shape *shape);
-/* Fields and scenes of the shape have the new code at once. Their Lipschitz figures and coarse_error stay those that
-   dist_shape_create sampled: what is thin, and how.certified, ask for a new shape where code or weights have come
-   far. */
+/* code NULL: zeros. Fields and scenes of the shape have the new code at once. Their Lipschitz figures and coarse_error
+   stay those that dist_shape_create sampled: what is thin, and how.certified, ask for a new shape where code or weights
+   have come far. */
 DIST_API dist_status dist_shape_set_code(dist_shape *shape, const float *code);
 /* Color by a second net: rgb = g(code, color code, point), where g's code is the shape's followed by the color's; so
    dist_net_code_size(texture) is at least the shape's, and the rest is field.color_code_size. color_code is copied;
@@ -612,7 +612,9 @@ typedef struct dist_stats {
     float epsilon;                      /* the |f| in force, smallest over the picture */
     float lipschitz;                    /* in force */
     float steepest; /* the figure that samples following one another along a ray called for, where that is above the
-                       one in force, else 0: then how.certified proves nothing, render again with more than this */
+                       one in force, else 0: then how.certified proves nothing, render again with more than this. Where
+                       nobody told one (field.lipschitz 0), that samples all over the sphere called for, too: five for
+                       every 256 rays, 80 at most */
     float error; /* largest over the hits of what dist_images.error has: at a grazing ray on an outline that bound is
                     much larger than the error, so this tells of the worst pixel, not of the picture */
 } dist_stats;
@@ -682,8 +684,9 @@ typedef struct dist_contact {
 } dist_contact;
 
 /* n spheres (n, 4), center and radius (below 0: refused), against the field. A sphere that is clear of it, by the
-   figures for how.certified or those that its cache was made with, costs one query, or none where it is clear of the
-   bounding sphere. */
+   figures for how.certified (lipschitz 0: 1, so not of a steeper field) or those that its cache was made with, costs
+   one query, or none where it is clear of the bounding sphere. For how far a sphere can go ask for its contacts on the
+   way: f less its radius is no field to trace, since f need not be a distance away from the surface. */
 DIST_API dist_status dist_field_collide(dist_context *ctx, const dist_field *field, size_t n, const float *spheres,
                                         dist_contact *contacts);
 
@@ -738,8 +741,9 @@ DIST_API dist_tape *dist_tape_create(dist_context *ctx, const dist_camera *camer
 DIST_API void dist_tape_destroy(dist_tape *tape);
 
 /* Traces one ray per pixel and fills the planes that are not NULL. desc and tape may be NULL.
-   The tape borrows what the field points to until its last dist_render_backward; what that is then, another code or
-   other weights, must be what it was: the gradient would be neither's. No allocator call.
+   The tape borrows what the field points to until its last dist_render_backward, which refuses another code, other
+   weights or instances that have moved: the gradient would be neither's; what a field of your own points to must be
+   what it was. No allocator call.
    Rays that miss: mask 0, depth and distance desc->background, normal 0, silhouette > 0. UNRESOLVED: mask 0, normal 0,
    depth and distance the best so far. What is refused writes nothing and leaves the tape as it was. */
 DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, const dist_camera *camera,
@@ -748,7 +752,7 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
 #ifndef DIST_NO_BACKWARD
 /* Adjoint of the dist_render that filled the tape: reads d_out's depth, distance, normal, color, and silhouette if that
    was rendered; adds to grads; with how.relax_band color also at misses: outlines move, though not those that lie
-   before another surface. Of DIST_RAY_INSIDE only the silhouette counts, |f| where the ray starts, also where
+   before another surface. Of DIST_RAY_INSIDE only the silhouette counts: |f| where the ray starts, or f where
    how.inside makes a hit of it; a silhouette beside the bounding sphere is the camera's alone, not a scene's
    placements'. The least |f| of a ReLU net lies at a kink: the silhouette's gradient is that of one side; at a hit it
    is that of f there. What is not finite in d_out counts as 0. d_out->stats, if given, gets capped, backward_points and
@@ -771,7 +775,9 @@ DIST_API float dist_loss_depth(size_t n, const float *depth, const float *target
 /* mean -(normal . target) over hit pixels whose target normal (n, 3) is finite and not 0; the target is normalized */
 DIST_API float dist_loss_normal(size_t n, const float *normal, const float *target, const unsigned char *mask,
                                 float weight, float *d_normal);
-/* mean over all pixels of S_gt max(0, S) + (1 - S_gt) max(0, -S); S_gt = target[i] != 0              (paper, eq. 8) */
+/* mean over all pixels of S_gt max(0, S) + (1 - S_gt) max(0, -S); S_gt = target[i] != 0              (paper, eq. 8)
+   Of a shape that is too large it tells hardly more than none: S at a hit is about -epsilon, however far beyond the
+   outline. Its gradient does pull there; compare what was reached by the mask. */
 DIST_API float dist_loss_silhouette(size_t n, const float *silhouette, const unsigned char *target, float weight,
                                     float *d_silhouette);
 /* The same as the paper's authors average it: the mean of S over the pixels with S_gt = 1 and S > 0, plus the mean of
@@ -2434,7 +2440,15 @@ DISTI_INLINE void disti_norm_sums(int units, size_t lanes, size_t stride, float 
             variance[c] += d * d;
         }
     }
+    int large = 0;
+    for (size_t c = 0; c < lanes; c++) large |= !(variance[c] < 3e38f);
     for (size_t c = 0; c < lanes; c++) inverse[c] = 1.0f / sqrtf(variance[c] / (float)units + epsilon);
+    for (size_t c = 0; large && c < lanes; c++) { /* squares that do not fit a float */
+        double sum = 0.0;
+        if (variance[c] < 3e38f) continue;
+        for (size_t u = 0; u < count; u++) sum += (double)hat[u * stride + c] * (double)hat[u * stride + c];
+        inverse[c] = (float)(1.0 / sqrt(sum / (double)units + (double)epsilon));
+    }
 }
 
 /* forward   mu = mean_u x, v = mean_u (x - mu)^2, hat = (x - mu) / sqrt(v + eps), y = gamma hat + beta, for each of the
@@ -4174,9 +4188,33 @@ static unsigned disti_changes(const dist_field *field)
     return field->changes_fn ? field->changes_fn(field) : 0;
 }
 
-static int disti_stale(const dist_field *field)
+/* What a field may be too old for. COLOR: the shape, or one of the scene's, has got another texture since it was taken;
+   COUNT: the scene's weights have become more or fewer since then; FOLD and PAINT: the net's weights, or those of the
+   net that colors it, have changed since dist_shape_set_code; SPHERE: an instance has left the sphere since. A shape or
+   scene is looked at only where eval_fn is still its own (FOLD, SPHERE), or color_fn (COLOR, PAINT). */
+enum {
+    DISTI_STALE_COLOR = 1,
+    DISTI_STALE_COUNT = 2,
+    DISTI_STALE_FOLD = 4,
+    DISTI_STALE_PAINT = 8,
+    DISTI_STALE_SPHERE = 16
+};
+
+static int disti_stale(const dist_field *field, int what)
 {
-    return field->stale_fn ? field->stale_fn(field) : 0;
+    return field->stale_fn ? field->stale_fn(field, what) : 0;
+}
+
+/* Of bytes in words of 4, those that are left over aside; it goes on from `hash`. */
+static unsigned disti_hash(unsigned hash, size_t bytes, const void *data)
+{
+    uint32_t h = hash ^ 2166136261u, word;
+    for (size_t i = 0; i + 4 <= bytes; i += 4) {
+        memcpy(&word, (const unsigned char *)data + i, sizeof word);
+        h = (h ^ word) * 2654435761u;
+        h ^= h >> 15;
+    }
+    return h;
 }
 
 /* The figure from |f| = disti_far_from on. */
@@ -4248,6 +4286,12 @@ static dist_status disti_field_check(dist_context *ctx, const dist_field *field,
     dist_status status = disti_limits(ctx, function, sizeof limits / sizeof limits[0], limits);
     if (status != DIST_OK) return status;
     if (field->owner && field->owner != ctx) return disti_refuse(ctx, "%s: field belongs to another context", function);
+    int stale = disti_stale(field, DISTI_STALE_FOLD | DISTI_STALE_SPHERE);
+    if (stale)
+        return disti_refuse(ctx, stale & DISTI_STALE_FOLD ? "%s: the weights of the field's net have changed since "
+                                                            "dist_shape_set_code; call it again"
+                                                          : "%s: dist_scene_set has brought an instance out of the "
+                                                            "field's sphere; take dist_scene_field again", function);
     return field->cache ? disti_cache_check(ctx, field, function) : DIST_OK;
 }
 
@@ -4349,8 +4393,12 @@ static dist_status disti_color_check(dist_context *ctx, const dist_field *field,
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: field.code_size is %d, color_code_size %d, must not be negative",
                           function, field->code_size, field->color_code_size);
     if (field->owner && field->owner != ctx) return disti_refuse(ctx, "%s: field belongs to another context", function);
-    if (disti_stale(field) & 1)
-        return disti_refuse(ctx, "%s: the field, or one in its scene, is older than its shape's texture; take it anew",
+    int stale = disti_stale(field, DISTI_STALE_COLOR | DISTI_STALE_PAINT);
+    if (stale)
+        return disti_refuse(ctx, stale & DISTI_STALE_COLOR ? "%s: the field, or one in its scene, is older than its "
+                                                             "shape's texture; take it anew"
+                                                           : "%s: the weights of the net that colors the field have "
+                                                             "changed since dist_shape_set_code; call it again",
                             function);
     return DIST_OK;
 }
@@ -4571,7 +4619,7 @@ static dist_status disti_gradients_check(dist_context *ctx, const dist_field *fi
     if (grads->weights && !field->weights_fn)
         return disti_fail(ctx, DIST_UNSUPPORTED, "%s: grads.weights is given, but the field has no weights_fn",
                           function, 0, 0);
-    if ((grads->weights || grads->color_weights) && (disti_stale(field) & 2))
+    if ((grads->weights || grads->color_weights) && disti_stale(field, DISTI_STALE_COUNT))
         return disti_refuse(ctx, "%s: the scene has got a field with more or fewer weights since its field was taken; "
                                  "take it anew", function);
     if (grads->color_code && (field->color_code_size <= 0 || !field->color_adjoint_fn))
@@ -4714,7 +4762,7 @@ DIST_API dist_status dist_field_eikonal(dist_context *ctx, const dist_field *fie
             const float *p = points + 3 * (at + i), *g = gradient + 3 * i;
             if (!disti_finite(sdf[i]) || !disti_finite_all(3, g) || !disti_finite_all(3, p)) continue;
             double v[3] = {(double)g[0], (double)g[1], (double)g[2]}, length = sqrt(disti_dot(v, v));
-            double factor = length > 1e-12 ? 2.0 * (double)weight * (1.0 - 1.0 / length) / (double)n : 0.0;
+            double factor = length > 0.0 ? 2.0 * (double)weight * (1.0 - 1.0 / length) / (double)n : 0.0;
             sum += (length - 1.0) * (length - 1.0);
             if (factor == 0.0) continue;
             for (size_t k = 0; k < 3; k++) {
@@ -4786,7 +4834,7 @@ struct dist_scene {
     unsigned char *scratch; /* ctx->workers times scratch_bytes */
     size_t scratch_bytes, code_size, color_code_size;
     size_t weight_count[2]; /* of the nets and of the textures; 0 where they are too many */
-    unsigned changes; /* of the placements and fields, so far */
+    unsigned changes; /* of its instances' disti_scene_mark: the same once they are what they were */
 };
 
 enum { DISTI_SCENE_CHUNK = 2048, DISTI_SCENE_PIECE = DISTI_BLOCK, DISTI_CONTESTED = -2 };
@@ -5486,6 +5534,17 @@ static dist_status disti_placement_check(dist_context *ctx, const dist_similarit
     return status;
 }
 
+/* What the scene's changes go by of instance k: whose field it is and where it stands. */
+static unsigned disti_scene_mark(const dist_scene *scene, int k)
+{
+    const disti_placed *placed = &scene->placed[k];
+    unsigned hash = disti_hash((unsigned)k, sizeof placed->field.user, &placed->field.user);
+    hash = disti_hash(hash, sizeof placed->scale, &placed->scale);
+    hash = disti_hash(hash, sizeof placed->rotation, placed->rotation);
+    hash = disti_hash(hash, sizeof placed->translation, placed->translation);
+    return disti_hash(hash, sizeof scene->ball[k], &scene->ball[k]);
+}
+
 /* Checks an instance and puts it in place k; create: there is none yet. */
 static dist_status disti_scene_place(dist_scene *scene, int k, const dist_instance *instance, int create,
                                      const char *function)
@@ -5529,9 +5588,10 @@ static dist_status disti_scene_place(dist_scene *scene, int k, const dist_instan
             return disti_fail(ctx, DIST_BAD_ARGUMENT,
                               "%s: placement.translation puts the bounding sphere's center at %d on axis %d; must be "
                               "within 1e15 of 0", function, (double)ball.center[i], (double)i);
-    scene->changes++;
+    if (!create) scene->changes ^= disti_scene_mark(scene, k);
     *placed = next;
     scene->ball[k] = ball;
+    scene->changes ^= disti_scene_mark(scene, k);
 #ifndef DIST_NO_TRAIN
     for (int color = 0; color < 2 && !create && instance->field; color++) disti_scene_lay(scene, color);
 #endif
@@ -5644,27 +5704,46 @@ static float disti_scene_bound(const dist_scene *scene, float center[3])
     return (float)(scene->count > 1 ? least * (1.0 + 1e-6) : least);
 }
 
-/* A hash of how often it was set and of its instances' numbers, each of which only grows. */
 static unsigned disti_scene_changes(const dist_field *field)
 {
     if (field->eval_fn != disti_scene_eval) return 0;
     const dist_scene *scene = (const dist_scene *)field->user;
-    uint32_t hash = (2166136261u ^ scene->changes) * 16777619u;
-    for (int k = 0; k < scene->count; k++) hash = (hash ^ disti_changes(&scene->placed[k].field)) * 16777619u;
+    unsigned hash = scene->changes;
+    for (int k = 0; k < scene->count; k++) {
+        unsigned own = disti_changes(&scene->placed[k].field);
+        hash = disti_hash(hash, sizeof own, &own);
+    }
     return hash;
 }
 
-static int disti_scene_stale(const dist_field *field)
+/* Whether a ball lies in the field's sphere, but for rounding. */
+static int disti_ball_within(const disti_ball *ball, const dist_field *field)
 {
+    double square = 0.0;
+    for (int i = 0; i < 3; i++) {
+        double d = (double)ball->center[i] - (double)field->center[i];
+        square += d * d;
+    }
+    return sqrt(square) + (double)ball->radius <= (double)field->radius * (1.0 + 1e-5);
+}
+
+static int disti_scene_stale(const dist_field *field, int what)
+{
+    if (field->eval_fn != disti_scene_eval) what &= ~(DISTI_STALE_FOLD | DISTI_STALE_SPHERE);
+    if (field->color_fn != disti_scene_color) what &= ~(DISTI_STALE_COLOR | DISTI_STALE_PAINT);
     const dist_scene *scene = (const dist_scene *)field->user;
-    int stale = 0, others = 0;
-    for (int k = 0; k < scene->count; k++) stale |= disti_stale(&scene->placed[k].field);
-    if (field->color_fn != disti_scene_color) stale &= ~1;
+    int stale = 0, own = what & ~DISTI_STALE_COUNT;
+    for (int k = 0; own && k < scene->count; k++) {
+        stale |= disti_stale(&scene->placed[k].field, own);
+        if ((what & DISTI_STALE_SPHERE) && !disti_ball_within(&scene->ball[k], field)) stale |= DISTI_STALE_SPHERE;
+    }
 #ifndef DIST_NO_TRAIN
-    others = field->weight_count != scene->weight_count[0];
-    others |= field->color_weight_count != (disti_scene_paints(scene) == 2 ? scene->weight_count[1] : 0);
+    if ((what & DISTI_STALE_COUNT) &&
+        (field->weight_count != scene->weight_count[0] ||
+         field->color_weight_count != (disti_scene_paints(scene) == 2 ? scene->weight_count[1] : 0)))
+        stale |= DISTI_STALE_COUNT;
 #endif
-    return others ? stale | 2 : stale;
+    return stale;
 }
 
 DIST_API dist_field dist_scene_field(dist_scene *scene)
@@ -6617,7 +6696,7 @@ struct dist_net {
                         there; NULL: as in the file */
     float *half_panels; /* 32 bits each: two 16-bit weights; NULL: none */
     int half;           /* DIST_HALF_F16 or BF16, or 0 */
-    unsigned changes;   /* of the weights, so far */
+    unsigned changes;   /* disti_hash of the weights */
     size_t param_count, panel_count, half_count;
     char channel_names[DISTI_MAX_CHANNELS][8];
 };
@@ -6631,7 +6710,8 @@ struct dist_shape {
     float lipschitz, lipschitz_far, certified, certified_far, noise;
     float half_error; /* largest of 16 bits at the samples of disti_shape_slope */
     int half;         /* what the net had then */
-    unsigned changes; /* of the code, so far */
+    unsigned changes; /* disti_hash of the code */
+    unsigned folded;  /* its net's changes when the code was folded in */
     unsigned textures; /* that it got, so far */
     int groups;       /* disti_groups_pay */
     int wide;         /* its net's queries cost enough for one more look at a batch's points to pay */
@@ -8446,12 +8526,20 @@ static unsigned disti_shape_changes(const dist_field *field)
 {
     if (field->eval_fn != disti_shape_eval_fn && field->eval_fn != field->coarse_fn) return 0;
     const dist_shape *shape = (const dist_shape *)field->user;
-    return shape->changes + shape->net->changes;
+    const unsigned of[2] = {shape->net->changes, (unsigned)shape->net->half};
+    return disti_hash(shape->changes, sizeof of, of);
 }
 
-static int disti_shape_stale(const dist_field *field)
+static int disti_shape_stale(const dist_field *field, int what)
 {
-    return field->color_fn == disti_shape_color_fn && field->textures != ((const dist_shape *)field->user)->textures;
+    int is_own = field->eval_fn == disti_shape_eval_fn || (field->coarse_fn && field->eval_fn == field->coarse_fn);
+    int paints = field->color_fn == disti_shape_color_fn, stale = 0;
+    const dist_shape *shape = is_own || paints ? (const dist_shape *)field->user : NULL;
+    if (is_own && shape->folded != shape->net->changes) stale |= DISTI_STALE_FOLD;
+    if (paints && field->textures != shape->textures) stale |= DISTI_STALE_COLOR;
+    const dist_shape *paint = paints && shape->texture ? shape->texture : shape;
+    if (paints && paint->folded != paint->net->changes) stale |= DISTI_STALE_PAINT;
+    return stale & what;
 }
 
 DIST_API dist_field dist_shape_field(dist_shape *shape)
@@ -8530,7 +8618,12 @@ static void disti_net_fold(const dist_net *net, const float *code, float *bias)
     }
 }
 
-static void disti_shape_fold(dist_shape *shape) { disti_net_fold(shape->net, shape->code, shape->bias); }
+static void disti_shape_fold(dist_shape *shape)
+{
+    disti_net_fold(shape->net, shape->code, shape->bias);
+    shape->changes = disti_hash(0, (size_t)shape->net->code_size * sizeof(float), shape->code);
+    shape->folded = shape->net->changes;
+}
 
 /* Copies n numbers of a code, zeros for NULL; refuses what is not finite. */
 static dist_status disti_code_copy(dist_context *ctx, const char *function, int color, size_t n, const float *code,
@@ -8553,7 +8646,6 @@ static dist_status disti_shape_set_code(dist_shape *shape, const float *code, co
     dist_status status = disti_code_copy(shape->ctx, function, 0, size, code, shape->code);
     if (status != DIST_OK) return status;
     disti_shape_fold(shape);
-    shape->changes++;
     if (!shape->texture) return DIST_OK;
     memcpy(shape->texture->code, shape->code, size * sizeof(float));
     disti_shape_fold(shape->texture);
@@ -8860,6 +8952,7 @@ static void disti_half_pack(dist_net *net)
 static void disti_net_pack(dist_net *net)
 {
     memset(net->panels, 0, net->panel_count * sizeof(float));
+    net->changes = disti_hash(0, net->param_count * sizeof(float), net->params);
     for (int l = 0; l < net->layers; l++) {
         const disti_linear *layer = &net->layer[l];
         size_t rows = (size_t)(layer->prev + layer->point);
@@ -8966,7 +9059,6 @@ DIST_API dist_status dist_net_set_half(dist_context *ctx, dist_net *net, int kin
     net->half_panels = panels;
     net->half_count = count;
     net->half = kind;
-    net->changes++;
     if (kind != DIST_HALF_OFF) disti_half_pack(net);
     return DIST_OK;
 }
@@ -9720,7 +9812,7 @@ static dist_status disti_net_desc_check(dist_context *ctx, const dist_net_desc *
             return disti_fail(ctx, DIST_BAD_ARGUMENT,
                               i == 0   ? "dist_net_create: scale is %d, must be 1e-6 to 1e6, or 0"
                               : i == 1 ? "dist_net_create: bound is %d, must be 1e-6 to 1e6, or 0"
-                                       : "dist_net_create: clamp is %d, must be 0 to 1e6",
+                                       : "dist_net_create: clamp is %d, must be at most 1e6",
                               NULL, (double)value[i], 0);
     if (d->geometric && d->activation != DIST_ACTIVATION_RELU && d->activation != DIST_ACTIVATION_SOFTPLUS)
         return disti_fail(ctx, DIST_BAD_ARGUMENT,
@@ -9741,6 +9833,7 @@ DIST_API dist_net *dist_net_create(dist_context *ctx, const dist_net_desc *desc)
     if (d.scale == 0.0f) d.scale = d.activation == DIST_ACTIVATION_SINE ? 30.0f : 100.0f;
     if (d.bound == 0.0f) d.bound = 1.0f;
     if (d.clamp == 0.0f && d.code_size > 0 && !d.color) d.clamp = 0.1f;
+    if (d.clamp < 0.0f) d.clamp = 0.0f;
     if (disti_net_desc_check(ctx, &d) != DIST_OK) return NULL;
     dist_net *net = disti_net_new(ctx);
     if (!net) return NULL;
@@ -9790,7 +9883,6 @@ DIST_API dist_status dist_net_set_weights(dist_context *ctx, dist_net *net, cons
                               (double)i, (double)weights[i]);
     memcpy(net->params, weights, net->param_count * sizeof(float));
     disti_net_pack(net);
-    net->changes++;
     return DIST_OK;
 }
 
@@ -11421,6 +11513,42 @@ static void disti_stats_end(dist_context *ctx, const disti_tracer *tracer, dist_
     out->lipschitz = tracer->lipschitz;
 }
 
+/* Of a field whose Lipschitz figure nobody has told, f at some places and a step on in the direction in which it rises,
+   found by a step along each axis: a steep one's cones and rays may leave the sphere at once, with no second sample to
+   tell. */
+static void disti_stats_steepest(dist_context *ctx, const disti_tracer *tracer, dist_stats *out)
+{
+    enum { MOST = 16 };
+    const dist_field *field = tracer->field;
+    float points[MOST * 4 * 3], on[MOST * 3], sdf[MOST * 4], then[MOST];
+    double step = (double)field->radius / 64.0;
+    if (!out || out->rays < 256 || field->lipschitz > 0.0f || tracer->how.lipschitz > 0.0f) return;
+    size_t n = out->rays < 256 * MOST ? (size_t)(out->rays / 256) : (size_t)MOST;
+    if (tracer->how.max_queries > 0 && out->queries + 5 * n > tracer->how.max_queries) return;
+    for (size_t i = 0; i < n; i++) { /* spread over the ball */
+        double z = 1.0 - (2.0 * (double)i + 1.0) / MOST, r = sqrt(1.0 - z * z), turn = 2.399963 * (double)i;
+        double far = 0.95 * pow(((double)(5 * i % MOST) + 0.5) / MOST, 1.0 / 3.0) * (double)field->radius;
+        const double at[3] = {r * cos(turn), r * sin(turn), z};
+        for (size_t j = 0; j < 12; j++)
+            points[12 * i + j] = (float)((double)field->center[j % 3] + far * at[j % 3] +
+                                         (j / 3 == 1 + j % 3 ? step : 0.0));
+    }
+    disti_field_eval_all(ctx, field, 4 * n, points, sdf, NULL);
+    for (size_t i = 0; i < n; i++) {
+        double rise[3];
+        for (size_t k = 0; k < 3; k++) rise[k] = (double)sdf[4 * i + 1 + k] - (double)sdf[4 * i];
+        disti_normalize(rise);
+        for (size_t k = 0; k < 3; k++) on[3 * i + k] = (float)((double)points[12 * i + k] + step * rise[k]);
+    }
+    disti_field_eval_all(ctx, field, n, on, then, NULL);
+    out->queries += 5 * n;
+    out->march_queries += 5 * n;
+    for (size_t i = 0; i < n; i++) {
+        float slope = (float)(((double)then[i] - (double)sdf[4 * i]) / step);
+        if (disti_finite(slope) && slope > 1.001f * tracer->lipschitz && slope > out->steepest) out->steepest = slope;
+    }
+}
+
 /* What is told of the error: the distance goes out as a float, which rounds off up to 2^-24 of it; and where f is off
    by coarse_error, its zero is by that over the slope, which is the exact f's: two samples of a field that is rough by
    that much tell of none above half the Lipschitz figure. */
@@ -11540,6 +11668,7 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
     disti_free_job job = {&tracer, n, origins, directions, hits};
     disti_run(ctx, (int)((n + DISTI_FREE_RAYS - 1) / DISTI_FREE_RAYS), disti_free_task, &job);
     disti_stats_end(ctx, &tracer, stats);
+    disti_stats_steepest(ctx, &tracer, stats);
     return DIST_OK;
 }
 
@@ -13967,6 +14096,7 @@ struct dist_tape {
     int *order;             /* of the tiles: first those that cost most then */
     int tiled;              /* the size of these tiles; 0: there are none */
     int rendered, has_silhouette;
+    unsigned changes;       /* disti_changes of its field then */
     dist_field field;
     dist_camera camera;
     disti_tracer tracer;
@@ -15703,11 +15833,13 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     if (!listed) disti_render_order(&job);
     disti_run(ctx, job.count, listed ? disti_render_list_task : disti_render_task, &job);
     disti_stats_end(ctx, &tracer, out->stats);
+    disti_stats_steepest(ctx, &tracer, out->stats);
     if (!tape) return DIST_OK;
     tape->rendered = 1;
     tape->tiled = listed ? 0 : job.tile;
     tape->has_silhouette = job.least;
     tape->field = *field;
+    tape->changes = disti_changes(field);
     tape->camera = *camera;
     tape->tracer = tracer;
     tape->tracer.field = &tape->field;
@@ -16189,6 +16321,9 @@ DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *ta
     if (!d_out) return disti_refuse(ctx, "%s: d_out is NULL", name);
     status = disti_gradients_check(ctx, &tape->field, grads, name);
     if (status != DIST_OK) return status;
+    if (disti_changes(&tape->field) != tape->changes)
+        return disti_refuse(ctx, "%s: the field's code, weights or instances are not what they were in dist_render; "
+                                 "change them after the backward pass", name);
     if (d_out->silhouette && !tape->has_silhouette && tape->trace != DIST_TRACE_PAPER)
         return disti_refuse(ctx, "%s: d_out.silhouette is given, but out.silhouette was NULL in dist_render", name);
     if (d_out->color) status = disti_color_check(ctx, &tape->field, 1, name);
@@ -16197,7 +16332,8 @@ DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *ta
     size_t size = (size_t)tape->field.code_size + (size_t)tape->field.color_code_size, room = ctx->partial_size - 1;
     if (!grads->code && !grads->color_code && !d_out->color) size = 0; /* no code's gradient is summed */
     if (size + size / DISTI_SLOTS > room) /* see disti_partial_for */
-        return disti_fail(ctx, DIST_UNSUPPORTED, "%s: the field's codes have %d numbers, at most %d here", name,
+        return disti_fail(ctx, DIST_UNSUPPORTED, "%s: the field's codes have %d numbers, at most %d here; a "
+                                                 "dist_field_backward for one point makes room for more", name,
                           (double)size, (double)(room - room / (DISTI_SLOTS + 1)));
     job.tape = tape;
     job.d_out = d_out;
@@ -18045,7 +18181,12 @@ static dist_mesh *disti_mesh_parse(dist_context *ctx, const char *label, const v
         }
         if (off) r.text.at += prefix + 3;
         obj = !off;
-        good = off ? disti_read_off(&r) : disti_read_obj(&r);
+        size_t at = 0;
+        while (at < size && disti_is_space(text[at])) at++;
+        if (obj && at < size && text[at] != '#' && !(text[at] >= 'a' && text[at] <= 'z')) /* as all lines begin */
+            good = disti_mesh_fail(&r, DIST_BAD_FILE, "this is no PLY, OBJ or OFF file", 0);
+        else
+            good = off ? disti_read_off(&r) : disti_read_obj(&r);
     }
     const char *format = obj ? "dist_mesh_read (%s): a face has vertex %d, must be 1 to %d"
                              : "dist_mesh_read (%s): a face has vertex %d, must be below %d";

@@ -231,6 +231,19 @@ TEST(decimals_are_those_of_printf_and_bring_every_float_back)
     }
 }
 
+TEST(what_is_no_mesh_at_all_is_said_to_be_none)
+{
+    static const char *const files[] = {"Pf\n2 2\n-1.0\nabcdabcdabcdv v v\n", "\211PNG\r\n\032\n v 1 2\n", " \n{\"codes\":1}",
+                                        "\177ELF", "OFFSET 3\nv 1 2 3\n"};
+    for (size_t i = 0; i < sizeof files / sizeof files[0]; i++) {
+        dist_context *ctx = test_context();
+        CHECK(!dist_mesh_read(ctx, files[i], strlen(files[i])));
+        CHECK_STATUS(DIST_BAD_FILE, dist_context_status(ctx), ctx);
+        CHECK_TEXT("this is no PLY, OBJ or OFF file", dist_context_message(ctx));
+        dist_context_destroy(ctx);
+    }
+}
+
 TEST(normals_are_written_to_both_formats)
 {
     dist_context *ctx = test_context();
@@ -713,6 +726,7 @@ int main(int argc, char **argv)
     RUN(real_pfm_files_load);
     RUN(meshes_written_and_read_again_have_the_same_bits);
     RUN(decimals_are_those_of_printf_and_bring_every_float_back);
+    RUN(what_is_no_mesh_at_all_is_said_to_be_none);
     RUN(normals_are_written_to_both_formats);
     RUN(every_dialect_reads_as_the_same_square);
     RUN(what_a_mesh_file_has_wrong_is_told_as_the_file_counts);

@@ -381,6 +381,46 @@ TEST(gradients_of_lone_points_are_finite_where_those_of_others_are)
     CHECK(tiny > 0);
 }
 
+/* LayerNorm takes out how large a layer's sums are, also where their squares are beyond a float. */
+TEST(a_layer_norm_of_sums_of_any_size_is_the_same)
+{
+    enum { MOST = 60 };
+    float points[3 * MOST], sdf[5][MOST], slope[5][3 * MOST], few[MOST], slopes[3 * MOST];
+    test_random random = test_random_seed(4);
+    test_random_fill(&random, 3 * MOST, points, -1.0f, 1.0f);
+    for (int activation = 0; activation < 2; activation++) {
+        for (int k = 0; k < 5; k++) {
+            const double scales[5] = {1e10, 1e18, 3e19, 1e24, 1e30};
+            model_desc desc = {.hidden = 3, .width = 37, .normed = 1};
+            desc.activation = activation ? DIST_ACTIVATION_SOFTPLUS : DIST_ACTIVATION_RELU;
+            desc.first_scale = desc.scale = activation ? 10 : 0;
+            model m = model_make(&desc, 3);
+            size_t inner = (size_t)(m.in[0] + 1) * (size_t)m.out[0];
+            for (size_t i = 0; i < inner; i++) m.params[m.offset[0] + i] *= scales[k];
+            dist_context *ctx = test_context();
+            dist_net *net = model_load(ctx, &m);
+            dist_shape *shape = dist_shape_create(ctx, net, NULL);
+            dist_field field = dist_shape_field(shape);
+            CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &field, MOST, points, sdf[k], slope[k]), ctx);
+            for (int i = 0; i < MOST; i++) {
+                double p[3] = {(double)points[3 * i], (double)points[3 * i + 1], (double)points[3 * i + 2]};
+                CHECK_NEAR(model_eval(&m, m.params, m.codes, p), sdf[k][i], 2e-5);
+                for (int j = 0; j < 3; j++) CHECK_NEAR(slope[0][3 * i + j], slope[k][3 * i + j], 1e-3);
+            }
+            for (size_t n = 1; n < 14; n += 3) {
+                CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &field, n, points, few, NULL), ctx);
+                CHECK(same_values(n, sdf[k], few, 1));
+                CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &field, n, points, few, slopes), ctx);
+                for (size_t i = 0; i < 3 * n; i++) CHECK_NEAR(slope[0][i], slopes[i], 1e-3);
+            }
+            dist_shape_destroy(shape);
+            dist_net_destroy(net);
+            dist_context_destroy(ctx);
+            model_free(&m);
+        }
+    }
+}
+
 TEST(a_dead_unit_that_is_left_out_changes_no_bit)
 {
     for (int normed = 0; normed < 2; normed++) {
@@ -959,7 +999,7 @@ TEST(a_net_that_cannot_be_made_is_refused)
     static const char *const says[] = {
         "layers is 32, must be 1 to 31", "width is 4097", "skip is 4", "skip is -1", "code_size is -1",
         "activation is 6", "scale is -1", "bound is -1", "bound is 1100000", "scale is 1100000",
-        "clamp is 1100000, must be 0 to 1e6", "layers is -1", "geometric is 2, must be 0 to 1",
+        "clamp is 1100000, must be at most 1e6", "layers is -1", "geometric is 2, must be 0 to 1",
         "color is -3, must be 0 to 1", "output_linear is 2", "geometric is 1 with activation 3, must be 0"};
     for (int k = 0; k < (int)(sizeof says / sizeof says[0]); k++) {
         dist_context *ctx = test_context();
@@ -1768,6 +1808,7 @@ int main(int argc, char **argv)
     RUN(operations_of_a_net_are_its_multiply_adds);
     RUN(a_point_has_the_same_bits_in_every_batch);
     RUN(gradients_of_lone_points_are_finite_where_those_of_others_are);
+    RUN(a_layer_norm_of_sums_of_any_size_is_the_same);
     RUN(a_dead_unit_that_is_left_out_changes_no_bit);
     RUN(the_order_of_units_in_memory_does_not_show);
     RUN(a_few_points_have_the_bits_of_many);

@@ -1429,6 +1429,122 @@ static void poison_eval(void *user, int worker, size_t n, const float *points, f
     if (gradient) memset(gradient, 0, 3 * n * sizeof(float));
 }
 
+/* A field taken before an instance left its sphere, a shape whose net, or whose texture, has got other weights since
+   it was set, and a tape of what is no longer so are refused, wherever they are used; as soon as all is what it was, or
+   set anew, nothing is. */
+TEST(what_is_older_than_what_it_goes_by_is_refused)
+{
+    enum { SMALL = 16, N = SMALL * SMALL };
+    static float original[2][20000], other[2][20000], depth[N], ones[N], d_code[64];
+    const char *const left = "take dist_scene_field again", *const folded = "have changed since dist_shape_set_code";
+    dist_context *ctx = test_context();
+    dist_net_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.layers = 4;
+    desc.width = 32;
+    desc.code_size = 3;
+    desc.geometric = 1;
+    desc.clamp = -1;
+    dist_net *net = dist_net_create(ctx, &desc);
+    desc.geometric = 0;
+    desc.color = 1;
+    dist_net *paint = dist_net_create(ctx, &desc);
+    dist_shape *shape = dist_shape_create(ctx, net, NULL);
+    REQUIRE(net && paint && shape && dist_net_weight_count(net) <= 20000 && dist_net_weight_count(paint) <= 20000);
+    CHECK_STATUS(DIST_OK, dist_shape_set_texture(shape, paint, NULL), ctx);
+    dist_field field = dist_shape_field(shape);
+    CHECK_NEAR(0, field.clamp, 0); /* there is a code, but none was wanted */
+    dist_instance one[2];
+    memset(one, 0, sizeof one);
+    one[0].field = one[1].field = &field;
+    one[1].placement.translation[0] = 1.5f;
+    dist_scene *scene = dist_scene_create(ctx, 2, one), *outer = NULL;
+    dist_field all = dist_scene_field(scene), taken = all, around;
+    one[0].field = &all;
+    outer = dist_scene_create(ctx, 1, one);
+    around = dist_scene_field(outer);
+    dist_field *fields[3] = {&field, &all, &around};
+    dist_camera camera = shape_camera(SMALL, SMALL);
+    dist_tape *tape = dist_tape_create(ctx, &camera, NULL);
+    dist_images out, d_out;
+    dist_gradients grads;
+    memset(&out, 0, sizeof out);
+    memset(&d_out, 0, sizeof d_out);
+    memset(&grads, 0, sizeof grads);
+    out.depth = depth;
+    d_out.depth = ones;
+    grads.code = d_code;
+    REQUIRE(tape && outer && around.code_size <= 64);
+    for (int i = 0; i < N; i++) ones[i] = 1;
+    for (int k = 0; k < 2; k++)
+        for (size_t i = 0; i < dist_net_weight_count(k ? paint : net); i++) {
+            original[k][i] = dist_net_weights(k ? paint : net)[i];
+            other[k][i] = 1.01f * original[k][i];
+        }
+
+    one[1].placement.translation[0] = 3; /* out of the sphere, and back into it */
+    CHECK_STATUS(DIST_OK, dist_scene_set(scene, 1, &one[1]), ctx);
+    for (int k = 1; k < 3; k++) {
+        CHECK_STATUS(DIST_BAD_ARGUMENT, dist_render(ctx, fields[k], &camera, NULL, &out, NULL), ctx);
+        CHECK_TEXT(left, dist_context_message(ctx));
+        dist_context_clear(ctx);
+        CHECK_STATUS(DIST_BAD_ARGUMENT, dist_field_eval(ctx, fields[k], 1, ones, depth, NULL), ctx);
+        dist_context_clear(ctx);
+    }
+    all.radius = around.radius = 10; /* one's own, with room for it; but the scene around has the inner one's */
+    CHECK_STATUS(DIST_OK, dist_render(ctx, &all, &camera, NULL, &out, NULL), ctx);
+    CHECK_STATUS(DIST_BAD_ARGUMENT, dist_render(ctx, &around, &camera, NULL, &out, NULL), ctx);
+    dist_context_clear(ctx);
+    all = taken;
+    one[1].placement.translation[0] = 1.2f;
+    CHECK_STATUS(DIST_OK, dist_scene_set(scene, 1, &one[1]), ctx);
+    CHECK_STATUS(DIST_OK, dist_render(ctx, &around, &camera, NULL, &out, NULL), ctx);
+
+    const float code[3] = {0.1f, 0.2f, -0.1f};
+    for (int k = 0; k < 3; k++) { /* a tape of another code, of other weights, of another place; and back */
+        CHECK_STATUS(DIST_OK, dist_render(ctx, fields[k], &camera, NULL, &out, tape), ctx);
+        for (int what = 0; what < (k ? 3 : 2); what++)
+            for (int on = 1; on >= 0; on--) {
+                one[1].placement.translation[0] = on ? 1.1f : 1.2f;
+                if (what == 0) CHECK_STATUS(DIST_OK, dist_shape_set_code(shape, on ? code : NULL), ctx);
+                if (what == 1) CHECK_STATUS(DIST_OK, dist_net_set_weights(ctx, net, (on ? other : original)[0]), ctx);
+                if (what == 1) CHECK_STATUS(DIST_OK, dist_shape_set_code(shape, NULL), ctx);
+                if (what == 2) CHECK_STATUS(DIST_OK, dist_scene_set(scene, 1, &one[1]), ctx);
+                dist_status status = dist_render_backward(ctx, tape, &d_out, &grads);
+                CHECK_STATUS(on ? DIST_BAD_ARGUMENT : DIST_OK, status, ctx);
+                if (on) CHECK_TEXT("are not what they were in dist_render", dist_context_message(ctx));
+                dist_context_clear(ctx);
+            }
+    }
+    for (int k = 0; k < 3; k++) {
+        for (int on = 1; on >= 0; on--) { /* f, and with it all */
+            CHECK_STATUS(DIST_OK, dist_net_set_weights(ctx, net, (on ? other : original)[0]), ctx);
+            dist_status status = dist_render(ctx, fields[k], &camera, NULL, &out, NULL);
+            CHECK_STATUS(on ? DIST_BAD_ARGUMENT : DIST_OK, status, ctx);
+            if (on) CHECK_TEXT(folded, dist_context_message(ctx));
+            dist_context_clear(ctx);
+        }
+        for (int on = 1; on >= 0; on--) { /* color alone */
+            CHECK_STATUS(DIST_OK, dist_net_set_weights(ctx, paint, other[1]), ctx);
+            if (!on) CHECK_STATUS(DIST_OK, dist_shape_set_code(shape, NULL), ctx);
+            CHECK_STATUS(DIST_OK, dist_render(ctx, fields[k], &camera, NULL, &out, NULL), ctx);
+            dist_status status = dist_color_eval(ctx, fields[k], 1, ones, d_code);
+            CHECK_STATUS(on ? DIST_BAD_ARGUMENT : DIST_OK, status, ctx);
+            if (on) CHECK_TEXT(folded, dist_context_message(ctx));
+            dist_context_clear(ctx);
+        }
+        CHECK_STATUS(DIST_OK, dist_net_set_weights(ctx, paint, original[1]), ctx);
+        CHECK_STATUS(DIST_OK, dist_shape_set_code(shape, NULL), ctx);
+    }
+    dist_tape_destroy(tape);
+    dist_scene_destroy(outer);
+    dist_scene_destroy(scene);
+    dist_shape_destroy(shape);
+    dist_net_destroy(paint);
+    dist_net_destroy(net);
+    dist_context_destroy(ctx);
+}
+
 TEST(what_is_not_finite_stays_so)
 {
     dist_context *ctx = test_context();
@@ -2020,6 +2136,7 @@ int main(int argc, char **argv)
     RUN(sizes_below_zero_are_refused_and_a_plate_of_no_thickness_is_not);
     RUN(radii_that_floats_cannot_square_are_refused);
     RUN(scenes_refuse_what_cannot_be_placed);
+    RUN(what_is_older_than_what_it_goes_by_is_refused);
     RUN(what_is_not_finite_stays_so);
     RUN(what_is_not_finite_takes_nothing_from_a_placement);
     RUN(colors_are_those_of_the_instance_that_is_hit);

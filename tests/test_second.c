@@ -574,6 +574,39 @@ static dist_field cone_field(float numbers[2])
     return field;
 }
 
+/* However flat f is, the term pulls it up: of f = a (w . x), |w| = 1, dL/da = 2 (|a| - 1) sign(a), and 0 at a = 0. */
+TEST(eikonal_term_pulls_at_what_is_hardly_sloped)
+{
+    const float slopes[7] = {0.5f, 1e-3f, 1e-11f, -1e-13f, 1e-20f, 1e-37f, 0};
+    dist_context *ctx = test_context();
+    dist_net_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.layers = 1;
+    desc.width = 1;
+    desc.activation = DIST_ACTIVATION_NONE;
+    desc.output_linear = 1;
+    dist_net *net = dist_net_create(ctx, &desc);
+    REQUIRE(net && dist_net_weight_count(net) == 6);
+    for (int k = 0; k < 7; k++) {
+        float weights[6] = {0.6f, 0, -0.8f, 0.1f, 0, 0}, d_weights[6] = {0, 0, 0, 0, 0, 0}, loss = 0;
+        const float point[3] = {0.2f, 0.1f, -0.3f};
+        double a = (double)slopes[k];
+        weights[4] = slopes[k];
+        CHECK_STATUS(DIST_OK, dist_net_set_weights(ctx, net, weights), ctx);
+        dist_shape *shape = dist_shape_create(ctx, net, NULL);
+        dist_field field = dist_shape_field(shape);
+        dist_gradients grads;
+        memset(&grads, 0, sizeof grads);
+        grads.weights = d_weights;
+        CHECK_STATUS(DIST_OK, dist_field_eikonal(ctx, &field, 1, point, 1, &loss, &grads), ctx);
+        CHECK_NEAR((fabs(a) - 1) * (fabs(a) - 1), loss, 1e-6);
+        CHECK_NEAR(2 * (fabs(a) - 1) * (a > 0 ? 1 : a < 0 ? -1 : 0), d_weights[4], 1e-5);
+        dist_shape_destroy(shape);
+    }
+    dist_net_destroy(net);
+    dist_context_destroy(ctx);
+}
+
 TEST(eikonal_term_of_a_field_without_second_derivatives_is_by_differences)
 {
     enum { MANY = 7000 }; /* more than one chunk */
@@ -850,6 +883,7 @@ int main(int argc, char **argv)
     RUN(second_derivatives_by_the_users_blas_are_the_same);
     RUN(second_derivatives_of_two_spheres_sine_match_the_double);
     RUN(eikonal_term_and_its_gradients_match_the_double);
+    RUN(eikonal_term_pulls_at_what_is_hardly_sloped);
     RUN(eikonal_term_of_a_field_without_second_derivatives_is_by_differences);
     RUN(training_with_the_eikonal_term_makes_a_softplus_net_a_distance);
     RUN(training_with_the_eikonal_term_makes_a_sine_net_a_distance);

@@ -1730,6 +1730,56 @@ TEST(a_slope_beyond_the_lipschitz_figure_is_reported)
     dist_context_destroy(ctx);
 }
 
+/* Nobody has told the figure of a field of one's own: the picture of a sphere three times as steep is empty, and says
+   why; one of slope 1 says nothing, and small ones, and those without stats, cost nothing. */
+TEST(a_steep_field_whose_figure_nobody_told_is_told_of)
+{
+    static float origins[3 * PIXELS], directions[3 * PIXELS];
+    static dist_hit hits[PIXELS];
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(SIDE, SIDE);
+    for (int i = 0; i < PIXELS; i++)
+        dist_camera_ray(&camera, (float)(i % SIDE), (float)(i / SIDE), origins + 3 * i, directions + 3 * i);
+    for (int k = 0; k < 5; k++) {
+        const double slopes[5] = {1, 1.5, 3, 30, 0.2};
+        test_shape shape = shape_make(SHAPE_SPHERE, 0.5, 0, 0, 0);
+        shape.slope = slopes[k];
+        for (int told = 0; told < 2; told++) {
+            dist_field field = shape_field(&shape, 1, told ? slopes[k] : 0);
+            double expected = !told && slopes[k] > 1 ? slopes[k] : 0;
+            for (int certified = 0; certified < 2; certified++) {
+                dist_render_desc how = plain_how();
+                dist_stats stats, few;
+                dist_images out;
+                how.certified = certified;
+                memset(&out, 0, sizeof out);
+                out.mask = picture_a.mask;
+                long before = shape.queries;
+                CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+                long plain = shape.queries - before;
+                out.stats = &stats;
+                CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+                CHECK_NEAR(expected, stats.steepest, 1e-3 * expected);
+                CHECK(stats.hits > 0 || slopes[k] >= 3);
+                CHECK_EQUAL(plain + (told ? 0 : 80), stats.queries);
+                CHECK_EQUAL(before + 2 * plain + (told ? 0 : 80), shape.queries);
+                CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, PIXELS, origins, directions, &how, hits, &stats), ctx);
+                CHECK_NEAR(expected, stats.steepest, 1e-3 * expected);
+                CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, 255, origins, directions, &how, hits, &few), ctx);
+                CHECK_NEAR(0, few.steepest, 0); /* none of them nears the sphere */
+                how.max_queries = stats.queries - 1;
+                CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, PIXELS, origins, directions, &how, hits, &few), ctx);
+                CHECK(few.queries <= how.max_queries);
+                how.max_queries = 0;
+                how.lipschitz = (float)slopes[k];
+                CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, PIXELS, origins, directions, &how, hits, &stats), ctx);
+                CHECK(!(stats.steepest > 0) && stats.hits > PIXELS / 20);
+            }
+        }
+    }
+    dist_context_destroy(ctx);
+}
+
 /* A sphere three to five times as steep as is said: rays step over it. Where the samples of the silhouette find the
    solid, the ray is not told to be a miss, and the figure that it takes is told, though no ray met it. */
 TEST(a_solid_that_only_the_silhouette_finds_is_no_miss)
@@ -2312,6 +2362,7 @@ int main(int argc, char **argv)
     RUN(each_row_of_the_ladder_asks_less_than_the_one_before);
     RUN(the_paper_converges_up_to_slope_1_2_and_not_from_1_34_on);
     RUN(a_slope_beyond_the_lipschitz_figure_is_reported);
+    RUN(a_steep_field_whose_figure_nobody_told_is_told_of);
     RUN(a_solid_that_only_the_silhouette_finds_is_no_miss);
     RUN(few_steps_bound_what_they_may_have_passed);
     RUN(no_error_is_below_0);

@@ -8533,12 +8533,16 @@ static unsigned disti_shape_changes(const dist_field *field)
 static int disti_shape_stale(const dist_field *field, int what)
 {
     int is_own = field->eval_fn == disti_shape_eval_fn || (field->coarse_fn && field->eval_fn == field->coarse_fn);
-    int paints = field->color_fn == disti_shape_color_fn, stale = 0;
-    const dist_shape *shape = is_own || paints ? (const dist_shape *)field->user : NULL;
-    if (is_own && shape->folded != shape->net->changes) stale |= DISTI_STALE_FOLD;
-    if (paints && field->textures != shape->textures) stale |= DISTI_STALE_COLOR;
-    const dist_shape *paint = paints && shape->texture ? shape->texture : shape;
-    if (paints && paint->folded != paint->net->changes) stale |= DISTI_STALE_PAINT;
+    int stale = 0;
+    if ((what & DISTI_STALE_FOLD) && is_own) {
+        const dist_shape *shape = (const dist_shape *)field->user;
+        if (shape->folded != shape->net->changes) stale |= DISTI_STALE_FOLD;
+    }
+    if ((what & (DISTI_STALE_COLOR | DISTI_STALE_PAINT)) && field->color_fn == disti_shape_color_fn) {
+        const dist_shape *shape = (const dist_shape *)field->user, *paint = shape->texture ? shape->texture : shape;
+        if (field->textures != shape->textures) stale |= DISTI_STALE_COLOR;
+        if (paint->folded != paint->net->changes) stale |= DISTI_STALE_PAINT;
+    }
     return stale & what;
 }
 

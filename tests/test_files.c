@@ -233,8 +233,8 @@ TEST(decimals_are_those_of_printf_and_bring_every_float_back)
 
 TEST(what_is_no_mesh_at_all_is_said_to_be_none)
 {
-    static const char *const files[] = {"Pf\n2 2\n-1.0\nabcdabcdabcdv v v\n", "\211PNG\r\n\032\n v 1 2\n", " \n{\"codes\":1}",
-                                        "\177ELF", "OFFSET 3\nv 1 2 3\n"};
+    static const char *const files[] = {"Pf\n2 2\n-1.0\nabcdabcdabcdv v v\n", "\211PNG\r\n\032\n v 1 2\n",
+                                        " \n{\"codes\":1}", "\177ELF", "OFFSET 3\nv 1 2 3\n"};
     for (size_t i = 0; i < sizeof files / sizeof files[0]; i++) {
         dist_context *ctx = test_context();
         CHECK(!dist_mesh_read(ctx, files[i], strlen(files[i])));

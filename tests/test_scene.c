@@ -1429,6 +1429,13 @@ static void poison_eval(void *user, int worker, size_t n, const float *points, f
     if (gradient) memset(gradient, 0, 3 * n * sizeof(float));
 }
 
+/* A shape's or a scene's field with another function and user, in memory of their own size; the rest is theirs. */
+static void wrapped_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    const dist_field *field = *(dist_field *const *)user;
+    field->eval_fn(field->user, worker, n, points, sdf, gradient);
+}
+
 /* A field taken before an instance left its sphere, a shape whose net, or whose texture, has got other weights since
    it was set, and a tape of what is no longer so are refused, wherever they are used; as soon as all is what it was, or
    set anew, nothing is. */
@@ -1500,6 +1507,16 @@ TEST(what_is_older_than_what_it_goes_by_is_refused)
     CHECK_STATUS(DIST_OK, dist_scene_set(scene, 1, &one[1]), ctx);
     CHECK_STATUS(DIST_OK, dist_render(ctx, &around, &camera, NULL, &out, NULL), ctx);
 
+    for (int k = 0; k < 3; k++) { /* what a wrapped one's user is, nobody knows */
+        dist_field wrapped = *fields[k], **user = (dist_field **)malloc(sizeof *user);
+        REQUIRE(user != NULL);
+        *user = fields[k];
+        wrapped.user = user;
+        wrapped.eval_fn = wrapped_eval;
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &wrapped, &camera, NULL, &out, NULL), ctx);
+        CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &wrapped, 1, ones, depth, NULL), ctx);
+        free(user);
+    }
     const float code[3] = {0.1f, 0.2f, -0.1f};
     for (int k = 0; k < 3; k++) { /* a tape of another code, of other weights, of another place; and back */
         CHECK_STATUS(DIST_OK, dist_render(ctx, fields[k], &camera, NULL, &out, tape), ctx);

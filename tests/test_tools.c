@@ -631,7 +631,8 @@ TEST(what_decoders_say_far_off_leads_to_the_nearest_part_all_the_same)
     static const struct {
         const char *name;
         int code;
-    } nets[] = {{NULL, 37}, {NULL, 111}, {"fox", 0}, {"bob_spot", 1}, {"primitives", 3}, {"chairs", 1}};
+    } nets[] = {{NULL, 37}, {NULL, 111}, {"fox", 0}, {"bob_spot", 1}, {"primitives", 3}, {"chairs", 1},
+                {"mug_camera_bottle", 1}};
     const float away[2] = {1.5f, 4};
     dist_context *ctx = test_context();
     int absent = 0;
@@ -650,7 +651,8 @@ TEST(what_decoders_say_far_off_leads_to_the_nearest_part_all_the_same)
         counted.user = &field;
         counted.eval_fn = counted_eval;
         surface_sample(&field, ctx, surface, &count);
-        CHECK(count > RAYS / 10);
+        int thin = k == 6; /* walls thinner than a cell, and f nearly 0 between them */
+        CHECK(count > RAYS / (thin ? 20 : 10));
         for (int band = 0; band < 2; band++) {
             test_random random = test_random_seed(131 + (unsigned)(2 * k + band));
             int off = 0, past = 0, lost = 0, told = 0;
@@ -683,9 +685,10 @@ TEST(what_decoders_say_far_off_leads_to_the_nearest_part_all_the_same)
             CHECK_STATUS(DIST_OK, dist_field_collide(ctx, &field, POINTS, points, contacts), ctx);
             for (int i = 0; i < POINTS; i++) told += contacts[i].status != DIST_RAY_HIT;
             CHECK_EQUAL(0, lost);
-            CHECK(past <= POINTS / 10);
-            CHECK(off <= 2); /* two parts in one cell may be taken for one */
-            CHECK(told <= 2);
+            CHECK(past <= POINTS / (thin ? 5 : 10));
+            CHECK(off <= (thin ? POINTS / 14 : 2)); /* two parts in one cell may be taken for one */
+            CHECK(told <= (thin ? POINTS / 25 : 2));
+            CHECK(worst < (thin ? 0.2 : 0.02) * (double)field.radius);
             CHECK(queries < 180);
             if (test_state.verbose)
                 printf("    %s %d, %g radii away: %d off by more than a 100th, %d a 500th, worst %.3f, %d not found, "

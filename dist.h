@@ -2252,8 +2252,8 @@ DISTI_INLINE float disti_log1p_exp(float x)
             q * (1.0f / 3 + q * (1.0f / 5 + q * (1.0f / 7 + q * (1.0f / 9 + q * (1.0f / 11 + q * (1.0f / 13)))))));
 }
 
-/* Sine and cosine of a double, range-reduced by multiples of pi / 2 in two parts: full float accuracy up to 1e9, of 0
-   beyond, and values in [-1, 1] for anything finite. */
+/* Sine and cosine of a double, range-reduced by multiples of pi / 2 in two parts, to about 1e-16 up to 1e4, so that an
+   angle doubled fifteen times keeps a float's digits; to 1e-16 of the angle up to 1e9, of 0 beyond. */
 DISTI_INLINE void disti_sincos(double x, double *sine, double *cosine)
 {
     x = x > -1e9 ? x : 0.0;
@@ -2266,9 +2266,11 @@ DISTI_INLINE void disti_sincos(double x, double *sine, double *cosine)
                         (-1.66666666666666324348e-1 +
                          s * (8.33333333332248946124e-3 +
                               s * (-1.98412698298579493134e-4 +
-                                   s * (2.75573137070700676789e-6 + s * -2.50507602534068634195e-8))));
+                                   s * (2.75573137070700676789e-6 +
+                                        s * (-2.50507602534068634195e-8 + s * 1.58969099521155010221e-10)))));
     double cs = 1.0 - s * (0.5 - s * (4.16666666666666019037e-2 - s * (1.38888888888741095749e-3 -
-                s * (2.48015872894767294178e-5 - s * 2.75573143513906633035e-7))));
+                s * (2.48015872894767294178e-5 - s * (2.75573143513906633035e-7 -
+                s * (2.08757232129817482790e-9 - s * 1.13596475577881948265e-11))))));
     double a = (k & 1) ? cs : sn, b = (k & 1) ? sn : cs;
     *sine = (k & 2) ? -a : a;
     *cosine = ((k + 1) & 2) ? -b : b;
@@ -9255,6 +9257,11 @@ static dist_status disti_loader_meta(disti_loader *loader)
                                    : "dist_net_load: metadata dist.encoding.levels is %s, which only fourier has",
                           disti_archive_meta(&loader->archive, encoding ? "dist.encoding" : "dist.encoding.levels"),
                           (double)levels, 0);
+    if (loader->status == DIST_OK && levels > 0 && net->base * (double)net->bound > 1e9) /* see disti_sincos */
+        disti_loader_fail(loader, DIST_UNSUPPORTED,
+                          "dist_net_load: metadata dist.encoding.base is %s and dist.bound %d, so angles go up to %d, "
+                          "not at most 1e9", disti_archive_meta(&loader->archive, "dist.encoding.base"),
+                          (double)net->bound, net->base * (double)net->bound);
     return loader->status;
 }
 

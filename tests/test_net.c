@@ -381,6 +381,46 @@ TEST(gradients_of_lone_points_are_finite_where_those_of_others_are)
     CHECK(tiny > 0);
 }
 
+/* f = one row of the encoded point: of the last of sixteen levels, whose angle is 2^15 times the first one's, too. */
+TEST(every_level_of_an_encoded_point_has_a_floats_digits)
+{
+    enum { LEVELS = 16, N = 200, POINT = 3 + 6 * LEVELS };
+    static float points[3 * N], sdf[N], gradient[3 * N], weights[POINT + 3];
+    dist_context *ctx = test_context();
+    dist_net_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.layers = 1;
+    desc.width = 1;
+    desc.levels = LEVELS;
+    desc.activation = DIST_ACTIVATION_NONE;
+    desc.output_linear = 1;
+    dist_net *net = dist_net_create(ctx, &desc);
+    REQUIRE(net && dist_net_weight_count(net) == POINT + 3);
+    test_random random = test_random_seed(8);
+    test_random_fill(&random, 3 * N, points, -1.0f, 1.0f);
+    double worst = 0;
+    for (int row = 3; row < POINT; row++) { /* sin and cos of x, y, z, level by level */
+        int level = (row - 3) / 6, axis = (row - 3) % 3, cosine = (row - 3) / 3 % 2;
+        memset(weights, 0, sizeof weights);
+        weights[row] = weights[POINT + 1] = 1;
+        CHECK_STATUS(DIST_OK, dist_net_set_weights(ctx, net, weights), ctx);
+        dist_shape *shape = dist_shape_create(ctx, net, NULL);
+        dist_field field = dist_shape_field(shape);
+        CHECK_STATUS(DIST_OK, dist_field_eval(ctx, &field, N, points, sdf, gradient), ctx);
+        for (int i = 0; i < N; i++) {
+            double base = ldexp(3.14159265358979323846, level), angle = base * (double)points[3 * i + axis];
+            worst = fmax(worst, fabs((double)sdf[i] - (cosine ? cos(angle) : sin(angle))));
+            double slope = (double)gradient[3 * i + axis] / base;
+            worst = fmax(worst, fabs(slope - (cosine ? -sin(angle) : cos(angle))));
+        }
+        dist_shape_destroy(shape);
+    }
+    if (test_state.verbose) printf("    worst %.3g\n", worst);
+    CHECK(worst < 1.3e-7);
+    dist_net_destroy(net);
+    dist_context_destroy(ctx);
+}
+
 /* LayerNorm takes out how large a layer's sums are, also where their squares are beyond a float. */
 TEST(a_layer_norm_of_sums_of_any_size_is_the_same)
 {
@@ -1421,6 +1461,9 @@ TEST(metadata_that_means_nothing_is_refused_with_a_sentence)
     REFUSED(DIST_BAD_FILE, "dist.encoding is fourier, so its levels are 1 to 16, not 0",
             "\"dist.encoding\":\"fourier\",\"dist.encoding.raw\":\"0\"", good_tensors);
     REFUSED(DIST_BAD_FILE, "levels are 1 to 16, not 0", "\"dist.encoding\":\"fourier\"", good_tensors);
+    REFUSED(DIST_UNSUPPORTED, "dist.encoding.base is 1e6 and dist.bound 2000, so angles go up to 2000000000",
+            "\"dist.encoding\":\"fourier\",\"dist.encoding.levels\":\"1\",\"dist.encoding.base\":\"1e6\","
+            "\"dist.bound\":\"2000\"", good_tensors);
     REFUSED(DIST_BAD_FILE, "dist.encoding.levels is 4, which only fourier has",
             "\"dist.encoding.levels\":\"4\"", good_tensors);
 }
@@ -1808,6 +1851,7 @@ int main(int argc, char **argv)
     RUN(operations_of_a_net_are_its_multiply_adds);
     RUN(a_point_has_the_same_bits_in_every_batch);
     RUN(gradients_of_lone_points_are_finite_where_those_of_others_are);
+    RUN(every_level_of_an_encoded_point_has_a_floats_digits);
     RUN(a_layer_norm_of_sums_of_any_size_is_the_same);
     RUN(a_dead_unit_that_is_left_out_changes_no_bit);
     RUN(the_order_of_units_in_memory_does_not_show);

@@ -157,6 +157,8 @@ typedef struct dist_context_desc {
     dist_logger logger;
     int blas_width; /* 0: 192; layers of 128 and less were faster without in every run of bench/bench_blas.c */
 } dist_context_desc;
+/* What will be used: every 0 replaced by its default, hooks aside. isa: what this processor and build have at best. */
+DIST_API dist_context_desc dist_context_desc_resolve(const dist_context_desc *desc);
 
 /* desc may be NULL. Returns NULL only if memory cannot be had or half of an allocator is given; any other failure (a
    refused hook) comes back as a context whose status says so and with which every further call fails with that
@@ -457,6 +459,7 @@ typedef struct dist_net_desc {
     float clamp;      /* 0: 0.1 with a code, none without one or of a texture; below 0: none */
     unsigned seed;
 } dist_net_desc;
+DIST_API dist_net_desc dist_net_desc_resolve(const dist_net_desc *desc); /* likewise; no clamp is 0 then */
 DIST_API dist_net *dist_net_create(dist_context *ctx, const dist_net_desc *desc);
 /* Replace all weights (dist_net_weight_count) or one stored code. The caller sees to it that no shape is in use by
    another thread. After new weights each shape of the net wants dist_shape_set_code before it is used again, and is
@@ -808,6 +811,7 @@ typedef struct dist_photometric_desc {
     float *warped;          /* (h, w, 3) of `to`: gets what `from` shows of it, 0 where nothing; NULL: not wanted */
     unsigned char *visible; /* (h, w) of `to`: gets 1 at the pixels that count; NULL: not wanted */
 } dist_photometric_desc;
+DIST_API dist_photometric_desc dist_photometric_desc_resolve(const dist_photometric_desc *desc); /* likewise */
 
 /* Photo `from` warped into view `to` through the depth of `to` and compared with what `to` saw:
        p = unproject_to(x, depth), x' = project_from(p),
@@ -861,6 +865,7 @@ typedef struct dist_mesh_desc {
     int normals;    /* 1: also normals, one gradient query a vertex */
     int refine;     /* Newton steps that move vertices onto the surface, 0 to 8 */
 } dist_mesh_desc;
+DIST_API dist_mesh_desc dist_mesh_desc_resolve(const dist_mesh_desc *desc); /* likewise */
 
 /* f = level within the field's bounding sphere's cube: closed unless the surface leaves the cube or, without no_skip,
    the Lipschitz figure, which of nets is a sample, rules out a cell that it goes through. An empty surface is a
@@ -1796,6 +1801,20 @@ static dist_status disti_context_check(dist_context *ctx, const dist_context_des
 
 /* All of dist_context_create but the memory of ctx itself. DIST_OUT_OF_MEMORY: nothing is held; after any other failure
    the context refuses everything. */
+DIST_API dist_context_desc dist_context_desc_resolve(const dist_context_desc *desc)
+{
+    dist_context_desc d;
+    memset(&d, 0, sizeof d);
+    if (desc) d = *desc;
+    if (d.blas_width == 0) d.blas_width = 192;
+    if (d.isa == DIST_ISA_AUTO) d.isa = disti_cpu_best();
+    if (d.workers == 0) d.workers = disti_default_workers();
+#ifndef DISTI_OPENMP
+    if (!d.scheduler.run_fn) d.workers = 1;
+#endif
+    return d;
+}
+
 static dist_status disti_context_begin(dist_context *ctx, const dist_context_desc *desc,
                                        const dist_allocator *allocator)
 {
@@ -1805,14 +1824,12 @@ static dist_status disti_context_begin(dist_context *ctx, const dist_context_des
     ctx->function = "dist_context_create";
     dist_status status = disti_context_check(ctx, desc);
     if (status != DIST_OK) return status;
-    ctx->scheduler = desc->scheduler;
-    ctx->blas = desc->blas;
-    ctx->blas_width = desc->blas_width > 0 ? desc->blas_width : 192;
-    ctx->isa = desc->isa == DIST_ISA_AUTO ? disti_cpu_best() : desc->isa;
-    ctx->workers = desc->workers > 0 ? desc->workers : disti_default_workers();
-#ifndef DISTI_OPENMP
-    if (!ctx->scheduler.run_fn) ctx->workers = 1;
-#endif
+    dist_context_desc d = dist_context_desc_resolve(desc);
+    ctx->scheduler = d.scheduler;
+    ctx->blas = d.blas;
+    ctx->blas_width = d.blas_width;
+    ctx->isa = d.isa;
+    ctx->workers = d.workers;
     ctx->scratch = (unsigned char *)disti_alloc_array(ctx, (size_t)ctx->workers, DISTI_SCRATCH_BYTES);
     return ctx->scratch ? DIST_OK : DIST_OUT_OF_MEMORY;
 }
@@ -9834,11 +9851,9 @@ static dist_status disti_net_desc_check(dist_context *ctx, const dist_net_desc *
     return DIST_OK;
 }
 
-DIST_API dist_net *dist_net_create(dist_context *ctx, const dist_net_desc *desc)
+DIST_API dist_net_desc dist_net_desc_resolve(const dist_net_desc *desc)
 {
     dist_net_desc d;
-    int skip[DISTI_MAX_LAYERS];
-    if (disti_enter(ctx, "dist_net_create") != DIST_OK) return NULL;
     memset(&d, 0, sizeof d);
     if (desc) d = *desc;
     if (d.layers == 0) d.layers = 8;
@@ -9847,6 +9862,14 @@ DIST_API dist_net *dist_net_create(dist_context *ctx, const dist_net_desc *desc)
     if (d.bound == 0.0f) d.bound = 1.0f;
     if (d.clamp == 0.0f && d.code_size > 0 && !d.color) d.clamp = 0.1f;
     if (d.clamp < 0.0f) d.clamp = 0.0f;
+    return d;
+}
+
+DIST_API dist_net *dist_net_create(dist_context *ctx, const dist_net_desc *desc)
+{
+    int skip[DISTI_MAX_LAYERS];
+    if (disti_enter(ctx, "dist_net_create") != DIST_OK) return NULL;
+    dist_net_desc d = dist_net_desc_resolve(desc);
     if (disti_net_desc_check(ctx, &d) != DIST_OK) return NULL;
     dist_net *net = disti_net_new(ctx);
     if (!net) return NULL;
@@ -11539,8 +11562,8 @@ static void disti_stats_steepest(dist_context *ctx, const disti_tracer *tracer, 
     size_t n = out->rays < 256 * MOST ? (size_t)(out->rays / 256) : (size_t)MOST;
     if (tracer->how.max_queries > 0 && out->queries + 5 * n > tracer->how.max_queries) return;
     for (size_t i = 0; i < n; i++) { /* spread over the ball */
-        double z = 1.0 - (2.0 * (double)i + 1.0) / MOST, r = sqrt(1.0 - z * z), turn = 2.399963 * (double)i;
-        double far = 0.95 * pow(((double)(5 * i % MOST) + 0.5) / MOST, 1.0 / 3.0) * (double)field->radius;
+        double z = 1.0 - (2.0 * (double)i + 1.0) / (double)MOST, r = sqrt(1.0 - z * z), turn = 2.399963 * (double)i;
+        double far = 0.95 * pow(((double)(5 * i % MOST) + 0.5) / (double)MOST, 1.0 / 3.0) * (double)field->radius;
         const double at[3] = {r * cos(turn), r * sin(turn), z};
         for (size_t j = 0; j < 12; j++)
             points[12 * i + j] = (float)((double)field->center[j % 3] + far * at[j % 3] +
@@ -16729,12 +16752,22 @@ static void disti_warp_sweep(const disti_photo_pair *pair, const dist_photometri
     }
 }
 
+DIST_API dist_photometric_desc dist_photometric_desc_resolve(const dist_photometric_desc *desc)
+{
+    dist_photometric_desc d;
+    memset(&d, 0, sizeof d);
+    if (desc) d = *desc;
+    if (d.visibility == 0.0f) d.visibility = 1e-3f;
+    return d;
+}
+
 DIST_API float dist_loss_photometric(const dist_photo *to, const dist_photo *from, const dist_photometric_desc *desc,
                                      float weight, float *d_depth, float d_cameras[12])
 {
     disti_photo_pair pair;
     double sum[4] = {0.0, 0.0, 0.0, 0.0}, again[4] = {0.0, 0.0, 0.0, 0.0}, scale[2], d_pose[12], turned[3];
-    float ssim = desc ? desc->ssim : 0.0f, visibility = desc ? desc->visibility : 0.0f;
+    const dist_photometric_desc how = dist_photometric_desc_resolve(desc);
+    float ssim = how.ssim, visibility = how.visibility;
     if (!to || !from || !to->color || !to->depth || !from->color) return 0.0f;
     if (!disti_finite(ssim) || ssim < 0.0f || ssim > 1.0f || !disti_finite(visibility)) return 0.0f;
     if (disti_camera_check(NULL, &to->camera, "") != DIST_OK || disti_camera_check(NULL, &from->camera, "") != DIST_OK)
@@ -16743,7 +16776,7 @@ DIST_API float dist_loss_photometric(const dist_photo *to, const dist_photo *fro
     pair.to = to;
     pair.from = from;
     pair.ssim = (double)ssim;
-    pair.visibility = visibility == 0.0f ? 1e-3 : (double)visibility;
+    pair.visibility = (double)visibility;
     disti_view_of(&to->camera, &pair.view_to);
     disti_view_of(&from->camera, &pair.view_from);
     for (int i = 0; i < 3; i++)
@@ -17259,21 +17292,28 @@ static dist_status disti_extract_check(dist_context *ctx, const dist_field *fiel
     return disti_limits(ctx, name, sizeof limits / sizeof limits[0], limits);
 }
 
+DIST_API dist_mesh_desc dist_mesh_desc_resolve(const dist_mesh_desc *desc)
+{
+    dist_mesh_desc d;
+    memset(&d, 0, sizeof d);
+    if (desc) d = *desc;
+    if (d.resolution == 0) d.resolution = 128;
+    return d;
+}
+
 DIST_API dist_mesh *dist_mesh_extract(dist_context *ctx, const dist_field *field, const dist_mesh_desc *desc)
 {
     disti_extract x;
     disti_case cases[256];
-    dist_mesh_desc d;
     if (disti_enter(ctx, "dist_mesh_extract") != DIST_OK) return NULL;
     if (disti_extract_check(ctx, field, desc) != DIST_OK) return NULL;
-    memset(&d, 0, sizeof d);
-    if (desc) d = *desc;
+    dist_mesh_desc d = dist_mesh_desc_resolve(desc);
     memset(&x, 0, sizeof x);
     x.ctx = ctx;
     x.field = field;
     x.cases = cases;
     x.level = d.level;
-    x.cells = d.resolution ? (size_t)d.resolution : 128;
+    x.cells = (size_t)d.resolution;
     x.side = x.cells + 1;
     x.no_skip = d.no_skip;
     disti_extract_blocks(&x);

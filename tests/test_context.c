@@ -901,6 +901,52 @@ TEST(the_callers_floating_point_state_neither_matters_nor_changes)
     }
 }
 
+/* Every desc's defaults are what _resolve says; what is not 0 stays, and a second one changes nothing. */
+TEST(what_a_zeroed_desc_means_is_told)
+{
+    dist_context_desc context = dist_context_desc_resolve(NULL), same = dist_context_desc_resolve(&context);
+    dist_context *ctx = dist_context_create(NULL);
+    CHECK_EQUAL(dist_context_workers(ctx), context.workers);
+    CHECK_EQUAL(dist_context_isa(ctx), context.isa);
+    CHECK_EQUAL(192, context.blas_width);
+    CHECK(same.workers == context.workers && same.isa == context.isa && same.blas_width == context.blas_width);
+    context.isa = DIST_ISA_SCALAR;
+    context.blas_width = 77;
+    context = dist_context_desc_resolve(&context);
+    CHECK(context.isa == DIST_ISA_SCALAR && context.blas_width == 77);
+    dist_context_destroy(ctx);
+
+    dist_mesh_desc mesh = dist_mesh_desc_resolve(NULL);
+    CHECK_EQUAL(128, mesh.resolution);
+    mesh.resolution = 5;
+    CHECK_EQUAL(5, dist_mesh_desc_resolve(&mesh).resolution);
+    dist_photometric_desc photo = dist_photometric_desc_resolve(NULL);
+    CHECK_NEAR(1e-3, photo.visibility, 1e-9);
+    photo.visibility = -1;
+    CHECK_NEAR(-1, dist_photometric_desc_resolve(&photo).visibility, 0);
+#ifndef DIST_NO_TRAIN
+    const struct {
+        int code_size, activation, color;
+        float clamp, expected, scale;
+    } nets[6] = {{0, DIST_ACTIVATION_RELU, 0, 0, 0, 100},     {4, DIST_ACTIVATION_RELU, 0, 0, 0.1f, 100},
+                 {4, DIST_ACTIVATION_SINE, 1, 0, 0, 30},      {4, DIST_ACTIVATION_SOFTPLUS, 0, -1, 0, 100},
+                 {0, DIST_ACTIVATION_RELU, 0, -2, 0, 100},    {0, DIST_ACTIVATION_RELU, 0, 0.3f, 0.3f, 100}};
+    for (int k = 0; k < 6; k++) {
+        dist_net_desc desc;
+        memset(&desc, 0, sizeof desc);
+        desc.code_size = nets[k].code_size;
+        desc.activation = nets[k].activation;
+        desc.color = nets[k].color;
+        desc.clamp = nets[k].clamp;
+        dist_net_desc d = dist_net_desc_resolve(&desc);
+        CHECK(d.layers == 8 && d.width == 512 && d.bound == 1);
+        CHECK_NEAR(nets[k].scale, d.scale, 0);
+        CHECK_NEAR(nets[k].expected, d.clamp, 0);
+    }
+    CHECK_EQUAL(512, dist_net_desc_resolve(NULL).width);
+#endif
+}
+
 int main(int argc, char **argv)
 {
     test_begin(argc, argv);
@@ -922,5 +968,6 @@ int main(int argc, char **argv)
     RUN(tasks_fit_on_small_stacks);
     RUN(what_is_not_finite_traps_nothing);
     RUN(the_callers_floating_point_state_neither_matters_nor_changes);
+    RUN(what_a_zeroed_desc_means_is_told);
     return test_report();
 }

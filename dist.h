@@ -262,7 +262,7 @@ typedef struct dist_field {
     unsigned (*changes_fn)(const struct dist_field *field);
     /* what is out of date, of the DISTI_STALE_* bits asked for: then it is refused. Set likewise */
     int (*stale_fn)(const struct dist_field *field, int what);
-    unsigned textures; /* how often it had got one then */
+    unsigned taken; /* then: how many textures the shape had got, or what the scene's instances were. Set likewise */
     const struct dist_cache *cache; /* set by dist_cache_field; NULL: none */
 } dist_field;
 
@@ -5753,10 +5753,10 @@ static int disti_scene_stale(const dist_field *field, int what)
     if (field->eval_fn != disti_scene_eval) what &= ~(DISTI_STALE_FOLD | DISTI_STALE_SPHERE);
     if (field->color_fn != disti_scene_color) what &= ~(DISTI_STALE_COLOR | DISTI_STALE_PAINT);
     const dist_scene *scene = (const dist_scene *)field->user;
-    int stale = 0, own = what & ~DISTI_STALE_COUNT;
+    int stale = 0, own = what & ~DISTI_STALE_COUNT, moved = (what & DISTI_STALE_SPHERE) && field->taken != scene->changes;
     for (int k = 0; own && k < scene->count; k++) {
         stale |= disti_stale(&scene->placed[k].field, own);
-        if ((what & DISTI_STALE_SPHERE) && !disti_ball_within(&scene->ball[k], field)) stale |= DISTI_STALE_SPHERE;
+        if (moved && !disti_ball_within(&scene->ball[k], field)) stale |= DISTI_STALE_SPHERE;
     }
 #ifndef DIST_NO_TRAIN
     if ((what & DISTI_STALE_COUNT) &&
@@ -5776,6 +5776,7 @@ DIST_API dist_field dist_scene_field(dist_scene *scene)
     field.owner = scene->ctx;
     field.changes_fn = disti_scene_changes;
     field.stale_fn = disti_scene_stale;
+    field.taken = scene->changes;
     field.lipschitz = field.lipschitz_far = 1.0f; /* phi outside the spheres, however flat the instances are */
     field.radius = disti_scene_bound(scene, field.center);
 #ifndef DIST_NO_TRAIN
@@ -8561,7 +8562,7 @@ static int disti_shape_stale(const dist_field *field, int what)
     }
     if ((what & (DISTI_STALE_COLOR | DISTI_STALE_PAINT)) && field->color_fn == disti_shape_color_fn) {
         const dist_shape *shape = (const dist_shape *)field->user, *paint = shape->texture ? shape->texture : shape;
-        if (field->textures != shape->textures) stale |= DISTI_STALE_COLOR;
+        if (field->taken != shape->textures) stale |= DISTI_STALE_COLOR;
         if (paint->folded != paint->net->changes) stale |= DISTI_STALE_PAINT;
     }
     return stale & what;
@@ -8577,7 +8578,7 @@ DIST_API dist_field dist_shape_field(dist_shape *shape)
     field.owner = shape->ctx;
     field.changes_fn = disti_shape_changes;
     field.stale_fn = disti_shape_stale;
-    field.textures = shape->textures;
+    field.taken = shape->textures;
     if (net->sdf_channel >= 0) {
         field.eval_fn = disti_shape_eval_fn;
         field.fused_fn = disti_shape_fused;

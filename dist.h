@@ -356,7 +356,7 @@ DIST_API dist_scene *dist_scene_create(dist_context *ctx, int count, const dist_
 DIST_API void dist_scene_destroy(dist_scene *scene);
 /* Moves an instance or replaces its field (NULL: it stays) by one whose code is as long and that has a color if the old
    one had. No allocator call. Take dist_scene_field again afterwards, and set it in a scene that holds this one: the
-   bounding sphere changes, and where the weights stand. */
+   bounding sphere changes, and where the weights stand. A field whose sphere an instance has left is refused. */
 DIST_API dist_status dist_scene_set(dist_scene *scene, int index, const dist_instance *instance);
 /* The scene as a field. Borrows the scene. Its code is, for each instance, its field's code (nothing if that has no
    adjoint), then its placement as dist_similarity_move has it: log-scale, w of R' = exp([w]x) R, translation;
@@ -5753,7 +5753,8 @@ static int disti_scene_stale(const dist_field *field, int what)
     if (field->eval_fn != disti_scene_eval) what &= ~(DISTI_STALE_FOLD | DISTI_STALE_SPHERE);
     if (field->color_fn != disti_scene_color) what &= ~(DISTI_STALE_COLOR | DISTI_STALE_PAINT);
     const dist_scene *scene = (const dist_scene *)field->user;
-    int stale = 0, own = what & ~DISTI_STALE_COUNT, moved = (what & DISTI_STALE_SPHERE) && field->taken != scene->changes;
+    int moved = (what & DISTI_STALE_SPHERE) && field->taken != scene->changes;
+    int stale = 0, own = what & ~DISTI_STALE_COUNT;
     for (int k = 0; own && k < scene->count; k++) {
         stale |= disti_stale(&scene->placed[k].field, own);
         if (moved && !disti_ball_within(&scene->ball[k], field)) stale |= DISTI_STALE_SPHERE;

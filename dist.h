@@ -243,7 +243,8 @@ typedef struct dist_field {
     float noise;     /* how far rounding takes f off, part of every hit's error: counted as 5e-7 of the radius where
                         that is more. A net's is sampled by dist_shape_create */
     /* multiply-adds of a query, about; a net's field has its own. Below 5000 a picture without silhouette and tape is
-       traced with more queries and less bookkeeping: 1 where frames a second count, 0 where queries do */
+       traced with more queries and less bookkeeping, its normals are those of the last sample, next to the hit: 1 where
+       frames a second count, 0 where queries do */
     float cost;
     int kinks;       /* 1: grad f jumps (ReLU), which second_fn leaves out: a normal's gradient is by differences */
     int many;        /* 1: eval_fn is the faster the more points it gets at once, up to thousands */
@@ -345,10 +346,11 @@ typedef struct dist_instance {
 
 /* Several instances as one field: f(p) = min over i of s_i f_i(R_i^T (p - t_i) / s_i). A point asks only the instances
    whose bounding spheres can hold the minimum, nearest first, and none of them outside its sphere: there f_i goes on as
-   a lower bound of the distance, mostly below it. The defaults of how.epsilon and normal_delta, and how far a ray goes
-   on trust, go by the smallest instance's radius in the world, epsilon no smaller than float's noise, 5e-7 of the
-   scene's. Every point is held against every sphere: fast up to some hundred instances; more are better made scenes of
-   scenes. Belongs to the context that made it. */
+   a lower bound of the distance, mostly below it, which rises slowly at first: where an instance nearly touches its
+   sphere the silhouette of a ray just outside pulls little. The defaults of how.epsilon and normal_delta, and how far a
+   ray goes on trust, go by the smallest instance's radius in the world, epsilon no smaller than float's noise, 5e-7 of
+   the scene's. Every point is held against every sphere: fast up to some hundred instances; more are better made scenes
+   of scenes. Belongs to the context that made it. */
 typedef struct dist_scene dist_scene;
 /* NULL on failure. Instances may share fields; a scene's field may be an instance of another scene. Takes 264 bytes for
    each number of the scene's code, for sums of its gradient. */
@@ -459,7 +461,7 @@ typedef struct dist_net_desc {
     float clamp;      /* 0: 0.1 with a code, none without one or of a texture; below 0: none */
     unsigned seed;
 } dist_net_desc;
-DIST_API dist_net_desc dist_net_desc_resolve(const dist_net_desc *desc); /* likewise; no clamp is 0 then */
+DIST_API dist_net_desc dist_net_desc_resolve(const dist_net_desc *desc); /* likewise; no clamp: 0 or below */
 DIST_API dist_net *dist_net_create(dist_context *ctx, const dist_net_desc *desc);
 /* Replace all weights (dist_net_weight_count) or one stored code. The caller sees to it that no shape is in use by
    another thread. After new weights each shape of the net wants dist_shape_set_code before it is used again, and is
@@ -821,9 +823,9 @@ DIST_API dist_photometric_desc dist_photometric_desc_resolve(const dist_photomet
    (z of p in `from` - its depth at x')^2 < visibility; from->depth may be NULL: nothing is hidden. Windows of SSIM
    (uniform; 1e-4 and 9e-4 its constants) count where all nine pixels do. Adds dL/ddepth of `to` to d_depth (h, w) and,
    each unless NULL, dL/d(rotation, translation) of `to` and then of `from` to d_cameras (12), at this depth: what the
-   depth itself does as the camera moves is dist_render_backward's to add. What is visible is held constant.
-   desc may be NULL. A camera that dist_render refuses, an ssim out of range, a visibility that is not finite: 0 and no
-   gradient. */
+   depth itself does as the camera moves is dist_render_backward's to add. What is visible is held constant; from's
+   depth at x' is the bilinear mean of the corners that are hits. desc may be NULL. A camera that dist_render refuses,
+   an ssim out of range, a visibility that is not finite: 0 and no gradient. */
 DIST_API float dist_loss_photometric(const dist_photo *to, const dist_photo *from, const dist_photometric_desc *desc,
                                      float weight, float *d_depth, float d_cameras[12]);
 
@@ -9840,7 +9842,7 @@ static dist_status disti_net_desc_check(dist_context *ctx, const dist_net_desc *
     if (status != DIST_OK) return status;
     const float value[3] = {d->scale, d->bound, d->clamp};
     for (int i = 0; i < 3; i++) /* what a file may say */
-        if (!disti_finite(value[i]) || value[i] < (i < 2 ? 1e-6f : 0.0f) || value[i] > 1e6f)
+        if (!disti_finite(value[i]) || (i < 2 && value[i] < 1e-6f) || value[i] > 1e6f)
             return disti_fail(ctx, DIST_BAD_ARGUMENT,
                               i == 0   ? "dist_net_create: scale is %d, must be 1e-6 to 1e6, or 0"
                               : i == 1 ? "dist_net_create: bound is %d, must be 1e-6 to 1e6, or 0"
@@ -9863,7 +9865,6 @@ DIST_API dist_net_desc dist_net_desc_resolve(const dist_net_desc *desc)
     if (d.scale == 0.0f) d.scale = d.activation == DIST_ACTIVATION_SINE ? 30.0f : 100.0f;
     if (d.bound == 0.0f) d.bound = 1.0f;
     if (d.clamp == 0.0f && d.code_size > 0 && !d.color) d.clamp = 0.1f;
-    if (d.clamp < 0.0f) d.clamp = 0.0f;
     return d;
 }
 
@@ -9895,7 +9896,7 @@ DIST_API dist_net *dist_net_create(dist_context *ctx, const dist_net_desc *desc)
         net->first_scale = net->scale = d.scale;
     net->output = d.output_linear ? DISTI_OUTPUT_NONE : d.color ? DISTI_OUTPUT_SIGMOID : DISTI_OUTPUT_TANH;
     net->bound = d.bound;
-    net->clamp = d.clamp;
+    net->clamp = DISTI_MAX(d.clamp, 0.0f);
     net->norm_epsilon = 1e-5f;
     for (int l = 0; l < net->layers; l++) {
         net->layer[l].out = l + 1 == net->layers ? net->channels : d.width;
@@ -11563,6 +11564,7 @@ static void disti_stats_steepest(dist_context *ctx, const disti_tracer *tracer, 
     if (!out || out->rays < 256 || field->lipschitz > 0.0f || tracer->how.lipschitz > 0.0f) return;
     size_t n = out->rays < 256 * MOST ? (size_t)(out->rays / 256) : (size_t)MOST;
     if (tracer->how.max_queries > 0 && out->queries + 5 * n > tracer->how.max_queries) return;
+    unsigned state = disti_float_state_enter();
     for (size_t i = 0; i < n; i++) { /* spread over the ball */
         double z = 1.0 - (2.0 * (double)i + 1.0) / (double)MOST, r = sqrt(1.0 - z * z), turn = 2.399963 * (double)i;
         double far = 0.95 * pow(((double)(5 * i % MOST) + 0.5) / (double)MOST, 1.0 / 3.0) * (double)field->radius;
@@ -11585,6 +11587,7 @@ static void disti_stats_steepest(dist_context *ctx, const disti_tracer *tracer, 
         float slope = (float)(((double)then[i] - (double)sdf[4 * i]) / step);
         if (disti_finite(slope) && slope > 1.001f * tracer->lipschitz && slope > out->steepest) out->steepest = slope;
     }
+    disti_float_state_leave(state);
 }
 
 /* What is told of the error: the distance goes out as a float, which rounds off up to 2^-24 of it; and where f is off

@@ -697,6 +697,18 @@ static void steep_eval(void *user, int worker, size_t n, const float *points, fl
     }
 }
 
+/* Of all that is not, or hardly, finite; nobody says how steep. */
+static void wild_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    const uint32_t bits[5] = {0x7f7fffffu, 0xff7fffffu, 0x7f800000u, 0xff800000u, 0x7fc00000u};
+    (void)user;
+    (void)worker;
+    for (size_t i = 0; i < n; i++) {
+        memcpy(sdf + i, bits + (size_t)(100.0f * fabsf(points[3 * i])) % 5, sizeof *sdf);
+        for (size_t k = 0; gradient && k < 3; k++) memcpy(gradient + 3 * i + k, bits + (i + k) % 5, sizeof *gradient);
+    }
+}
+
 /* With traps on, what is not finite is told, or counted, by functions that run on the caller's own state, and traps
    nothing. */
 TEST(what_is_not_finite_traps_nothing)
@@ -729,6 +741,16 @@ TEST(what_is_not_finite_traps_nothing)
     photo.color = colors;
     photo.depth = depth;
     how.ssim = points[4] = nan;
+    static float wild_depth[64 * 64];
+    dist_camera wide = dist_camera_look_at(64, 64, 0.7f, NULL, NULL, NULL);
+    dist_field wild = field;
+    dist_images out;
+    dist_stats stats;
+    memset(&out, 0, sizeof out);
+    out.depth = wild_depth;
+    out.stats = &stats;
+    wild.eval_fn = wild_eval;
+    wild.lipschitz = 0;
     state_set(STATES > 5 ? 5 : 0);
     dist_camera cameras[5] = {
         dist_camera_look_at(4, 4, nan, NULL, NULL, NULL), dist_camera_look_at(4, 4, 1e-45f, NULL, NULL, NULL),
@@ -740,7 +762,10 @@ TEST(what_is_not_finite_traps_nothing)
     size_t skipped = dist_adam_step(&adam, 2, x, gradient);
     float none = dist_loss_photometric(&photo, &photo, &how, 1, NULL, NULL);
     dist_status term = dist_field_eikonal(ctx, &field, 2, points, 3e38f, &loss, NULL);
+    dist_status seen = dist_render(ctx, &wild, &wide, NULL, &out, NULL);
     state_set(0);
+    CHECK_STATUS(DIST_OK, seen, ctx);
+    CHECK(stats.rays == 64 * 64 && test_finite((double)stats.steepest) && stats.queries > 80);
     CHECK(none == 0.0f);
     CHECK_STATUS(DIST_OK, term, ctx);
     CHECK(loss > 3e38f);
@@ -929,8 +954,8 @@ TEST(what_a_zeroed_desc_means_is_told)
         int code_size, activation, color;
         float clamp, expected, scale;
     } nets[6] = {{0, DIST_ACTIVATION_RELU, 0, 0, 0, 100},     {4, DIST_ACTIVATION_RELU, 0, 0, 0.1f, 100},
-                 {4, DIST_ACTIVATION_SINE, 1, 0, 0, 30},      {4, DIST_ACTIVATION_SOFTPLUS, 0, -1, 0, 100},
-                 {0, DIST_ACTIVATION_RELU, 0, -2, 0, 100},    {0, DIST_ACTIVATION_RELU, 0, 0.3f, 0.3f, 100}};
+                 {4, DIST_ACTIVATION_SINE, 1, 0, 0, 30},      {4, DIST_ACTIVATION_SOFTPLUS, 0, -1, -1, 100},
+                 {0, DIST_ACTIVATION_RELU, 0, -2, -2, 100},    {0, DIST_ACTIVATION_RELU, 0, 0.3f, 0.3f, 100}};
     for (int k = 0; k < 6; k++) {
         dist_net_desc desc;
         memset(&desc, 0, sizeof desc);
@@ -942,6 +967,7 @@ TEST(what_a_zeroed_desc_means_is_told)
         CHECK(d.layers == 8 && d.width == 512 && d.bound == 1);
         CHECK_NEAR(nets[k].scale, d.scale, 0);
         CHECK_NEAR(nets[k].expected, d.clamp, 0);
+        CHECK_NEAR(nets[k].expected, dist_net_desc_resolve(&d).clamp, 0);
     }
     CHECK_EQUAL(512, dist_net_desc_resolve(NULL).width);
 #endif

@@ -707,8 +707,8 @@ typedef struct dist_images {
     float *normal;         /* (h, w, 3), unit, outward, in how.normal_space (the camera's); 0 at a miss */
     float *silhouette;     /* min |f| along the ray - epsilon, signed: < 0 at a hit, > 0 at a miss. Far from the
                               outline, mostly from |f| of about .05 of the radius on, in coarse pictures from more, it
-                              is interpolated or another local minimum; of a ray beside the bounding sphere its
-                              distance from that */
+                              is interpolated or another local minimum; so are 7 in 10,000 rays right beside the
+                              outline of one of two parts. Of a ray beside the bounding sphere its distance from that */
     float *color;          /* (h, w, 3); how.background_color at a miss and where it is not finite */
     unsigned char *mask;   /* 1 hit, 0 not: the authority */
     unsigned char *status; /* DIST_RAY_* */

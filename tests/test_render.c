@@ -1710,6 +1710,84 @@ TEST(a_resolved_desc_gives_the_same_picture)
     dist_context_destroy(ctx);
 }
 
+/* The less of two balls, center and radius each. */
+static void two_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    const float *balls = (const float *)user;
+    (void)worker;
+    for (size_t i = 0; i < n; i++) {
+        sdf[i] = 3e38f;
+        for (int j = 0; j < 2; j++) {
+            float q[3], length = 1e-12f, f;
+            for (int k = 0; k < 3; k++) {
+                q[k] = points[3 * i + (size_t)k] - balls[4 * j + k];
+                length += q[k] * q[k];
+            }
+            length = sqrtf(length);
+            f = length - balls[4 * j + 3];
+            if (f >= sdf[i]) continue;
+            sdf[i] = f;
+            for (int k = 0; gradient && k < 3; k++) gradient[3 * i + (size_t)k] = q[k] / length;
+        }
+    }
+}
+
+/* A ray that misses both of two balls one of which a pixel beside it shows: nearly always the nearest of the two is
+   what the silhouette tells of; at a tile's border, where what the pixel beside it hit is not known, it may be the
+   other. */
+TEST(the_silhouette_beside_an_outline_is_that_of_the_part_beside_it)
+{
+    enum { PIC = 64, COUNT = PIC * PIC };
+    static float silhouette[COUNT];
+    static unsigned char hit[COUNT];
+    dist_context *ctx = shape_context();
+    test_random random = test_random_seed(77);
+    float eye[3] = {0, 0, -2.5f}, balls[8];
+    dist_camera camera = dist_camera_look_at(PIC, PIC, 0.7f, eye, NULL, NULL);
+    dist_field field;
+    dist_images out;
+    memset(&field, 0, sizeof field);
+    memset(&out, 0, sizeof out);
+    out.silhouette = silhouette;
+    out.mask = hit;
+    field.user = balls;
+    field.eval_fn = two_eval;
+    field.radius = field.lipschitz = 1;
+    field.detail = 0.1f;
+    int beside = 0, off = 0, pictures = test_quick() ? 300 : 1500;
+    for (int picture = 0; picture < pictures; picture++) {
+        for (int j = 0; j < 8; j++)
+            balls[j] = j % 4 < 3 ? test_random_float(&random, -0.45f, 0.45f) : test_random_float(&random, 0.1f, 0.4f);
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, NULL), ctx);
+        for (int i = 0; i < COUNT; i++) {
+            int x = i % PIC, y = i / PIC, shown = 0;
+            float o[3], d[3];
+            double least = 1e9;
+            for (int at = 0; at < 9 && !hit[i]; at++) {
+                int u = x + at % 3 - 1, v = y + at / 3 - 1;
+                shown += u >= 0 && v >= 0 && u < PIC && v < PIC && hit[v * PIC + u];
+            }
+            if (!shown) continue;
+            dist_camera_ray(&camera, (float)x, (float)y, o, d);
+            for (int j = 0; j < 2; j++) {
+                double q[3], along = 0, square = 0;
+                for (int k = 0; k < 3; k++) {
+                    q[k] = (double)o[k] - (double)balls[4 * j + k];
+                    along += q[k] * (double)d[k];
+                }
+                for (int k = 0; k < 3; k++) square += (q[k] - along * (double)d[k]) * (q[k] - along * (double)d[k]);
+                least = fmin(least, sqrt(square) - (double)balls[4 * j + 3]);
+            }
+            if (least < 1e-3 || least > 0.035) continue;
+            beside++;
+            off += fabs((double)silhouette[i] - least) > 0.2 * least + 1e-3;
+        }
+    }
+    if (test_state.verbose) printf("    %d of %d\n", off, beside);
+    CHECK(beside > 100 * pictures && 700 * off <= beside);
+    dist_context_destroy(ctx);
+}
+
 int main(int argc, char **argv)
 {
     test_begin(argc, argv);
@@ -1753,5 +1831,6 @@ int main(int argc, char **argv)
     RUN(extreme_budgets_give_the_best_so_far_and_leave_no_trace);
     RUN(a_query_budget_of_free_rays_is_kept);
     RUN(a_resolved_desc_gives_the_same_picture);
+    RUN(the_silhouette_beside_an_outline_is_that_of_the_part_beside_it);
     return test_report();
 }

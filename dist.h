@@ -11577,6 +11577,7 @@ static void disti_stats_steepest(dist_context *ctx, const disti_tracer *tracer, 
     for (size_t i = 0; i < n; i++) {
         double rise[3];
         for (size_t k = 0; k < 3; k++) rise[k] = (double)sdf[4 * i + 1 + k] - (double)sdf[4 * i];
+        if (!disti_finite_double(disti_dot(rise, rise))) memset(rise, 0, sizeof rise);
         disti_normalize(rise);
         for (size_t k = 0; k < 3; k++) on[3 * i + k] = (float)((double)points[12 * i + k] + step * rise[k]);
     }

@@ -697,6 +697,8 @@ static void steep_eval(void *user, int worker, size_t n, const float *points, fl
     }
 }
 
+static int wild_asked; /* at points that are not finite */
+
 /* Of all that is not, or hardly, finite; nobody says how steep. */
 static void wild_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
 {
@@ -704,7 +706,9 @@ static void wild_eval(void *user, int worker, size_t n, const float *points, flo
     (void)user;
     (void)worker;
     for (size_t i = 0; i < n; i++) {
-        memcpy(sdf + i, bits + (size_t)(100.0f * fabsf(points[3 * i])) % 5, sizeof *sdf);
+        int finite = test_finite_all(3, points + 3 * i);
+        wild_asked += !finite;
+        memcpy(sdf + i, bits + (finite ? (size_t)(100.0f * fabsf(points[3 * i])) % 5 : 0), sizeof *sdf);
         for (size_t k = 0; gradient && k < 3; k++) memcpy(gradient + 3 * i + k, bits + (i + k) % 5, sizeof *gradient);
     }
 }
@@ -765,6 +769,7 @@ TEST(what_is_not_finite_traps_nothing)
     dist_status seen = dist_render(ctx, &wild, &wide, NULL, &out, NULL);
     state_set(0);
     CHECK_STATUS(DIST_OK, seen, ctx);
+    CHECK_EQUAL(0, wild_asked);
     CHECK(stats.rays == 64 * 64 && test_finite((double)stats.steepest) && stats.queries > 80);
     CHECK(none == 0.0f);
     CHECK_STATUS(DIST_OK, term, ctx);

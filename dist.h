@@ -648,7 +648,7 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
    as far off as the nearest to within 1e-4 of the radius, but for one to six in a thousand of the points beyond the
    sphere where parts are small (by up to .014); of a trained decoder mostly to within a 500th, from far away, too: two
    parts of the surface in one cell may be taken for one. Where walls are thinner than a cell (a mug) one in six is off
-   by more, one in seventeen by more than a 100th, the worst by .16, and of spheres that are in by a 50th one in thirty
+   by more, one in eighteen by more than a 100th, the worst by .16, and of spheres that are in by a 50th one in thirty
    is told to be clear. Of a field clamped below a tenth of its radius the cells tell little: a part that is not the
    nearest, or none, may be what is found. Inside the sphere a distance is asked for 2 samples a point, mostly; a
    decoder from far away for 40 to 120 a point of some hundred in one call, which share the cells, and for 200 to 2000
@@ -5557,11 +5557,12 @@ static dist_status disti_placement_check(dist_context *ctx, const dist_similarit
     return status;
 }
 
-/* What the scene's changes go by of instance k: whose field it is and where it stands. */
+/* What the scene's changes go by of instance k: which field it is and where it stands. */
 static unsigned disti_scene_mark(const dist_scene *scene, int k)
 {
     const disti_placed *placed = &scene->placed[k];
     unsigned hash = disti_hash((unsigned)k, sizeof placed->field.user, &placed->field.user);
+    hash = disti_hash(hash, sizeof placed->field.eval_fn, &placed->field.eval_fn);
     hash = disti_hash(hash, sizeof placed->scale, &placed->scale);
     hash = disti_hash(hash, sizeof placed->rotation, placed->rotation);
     hash = disti_hash(hash, sizeof placed->translation, placed->translation);

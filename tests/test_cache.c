@@ -266,6 +266,15 @@ static dist_status trace_one(dist_context *ctx, const dist_field *field, float l
     return dist_trace(ctx, field, 1, o, d, &how, plain, NULL);
 }
 
+static void other_eval(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient)
+{
+    (void)user;
+    (void)worker;
+    (void)points;
+    for (size_t i = 0; i < n; i++) sdf[i] = 1;
+    if (gradient) memset(gradient, 0, 3 * n * sizeof *gradient);
+}
+
 TEST(a_cache_of_what_has_changed_is_refused_until_it_is_made_anew)
 {
     dist_context *ctx = test_context();
@@ -306,6 +315,23 @@ TEST(a_cache_of_what_has_changed_is_refused_until_it_is_made_anew)
         if (turn == 2) {
             one[1].placement.translation[0] = 2.9f;
             CHECK_STATUS(DIST_OK, dist_scene_set(scene, 1, &one[1]), ctx);
+        }
+        if (turn == 2) { /* the same user, another function */
+            dist_field same = field;
+            same.eval_fn = other_eval;
+            dist_cache *fresh = dist_cache_create(ctx, &scenery, 16);
+            REQUIRE(fresh != NULL);
+            dist_field kept = dist_cache_field(fresh);
+            CHECK_STATUS(DIST_OK, trace_one(ctx, &kept, 0), ctx);
+            one[1].field = &same;
+            CHECK_STATUS(DIST_OK, dist_scene_set(scene, 1, &one[1]), ctx);
+            CHECK_STATUS(DIST_BAD_ARGUMENT, trace_one(ctx, &kept, 0), ctx);
+            CHECK_TEXT(changed, dist_context_message(ctx));
+            one[1].field = &field;
+            dist_context_clear(ctx);
+            CHECK_STATUS(DIST_OK, dist_scene_set(scene, 1, &one[1]), ctx);
+            CHECK_STATUS(DIST_OK, trace_one(ctx, &kept, 0), ctx);
+            dist_cache_destroy(fresh);
         }
         if (turn == 3) { /* to another field, another code, and back: it is what it was */
             dist_shape *fresh = dist_shape_create(ctx, net, NULL);

@@ -646,15 +646,15 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
    surface as long as that brings it nearer, then a look around, through the cells of an octree (16 along each side of
    the cube around the bounding sphere) that the figures for how.certified do not show to be empty. Of a distance it is
    as far off as the nearest to within 1e-4 of the radius, but for one to six in a thousand of the points beyond the
-   sphere where parts are small (by up to .014); of a trained decoder mostly to within a 500th, from far away, too: two
-   parts of the surface in one cell may be taken for one. Where walls are thinner than a cell (a mug) one in six is off
-   by more, one in eighteen by more than a 100th, the worst by .16, and of spheres that are in by a 50th one in thirty
-   is told to be clear. Of a field clamped below a tenth of its radius the cells tell little: a part that is not the
+   sphere where parts are small (by up to .014); of a trained decoder to within a 500th but for one in a hundred, or
+   one in 25 (a fox), by up to .013, from far away, too: two parts of the surface in one cell may be taken for one.
+   Where walls are thinner than a cell (a camera's) one in three is off by more, one in fifteen by more than a 100th,
+   the worst by .04. Of a field clamped below a tenth of its radius the cells tell little: a part that is not the
    nearest, or none, may be what is found. Inside the sphere a distance is asked for 2 samples a point, mostly; a
-   decoder from far away for 40 to 120 a point of some hundred in one call, which share the cells, and for 200 to 2000
-   of a point alone. A cache spares the cells that it shows to be empty. Of a scene each instance that may be nearest is
-   gone to by itself; what is of one within another is no surface. closest (n, 3); distance (n) signed, below 0 inside,
-   and status (n) may be NULL: DIST_RAY_HIT, DIST_RAY_UNRESOLVED (no surface found: the last point tried),
+   decoder from far away for 40 to 140 a point of some hundred in one call, which share the cells, and for 300 to 2300
+   of a point alone. A cache spares the cells that it shows to be empty. Of a scene each instance that may be nearest
+   is gone to by itself; what is of one within another is no surface. closest (n, 3); distance (n) signed, below 0
+   inside, and status (n) may be NULL: DIST_RAY_HIT, DIST_RAY_UNRESOLVED (no surface found: the last point tried),
    DIST_RAY_NOT_FINITE. Nothing is asked outside the bounding sphere. */
 DIST_API dist_status dist_field_closest_point(dist_context *ctx, const dist_field *field, size_t n,
                                               const float *points, float *closest, float *distance,
@@ -11940,7 +11940,7 @@ typedef struct disti_foot {
 } disti_foot;
 
 enum { DISTI_FEET = 512, DISTI_FOOT_STEPS = 160, DISTI_FOOT_TURN = 48, DISTI_FOOT_SLIDES = 16, DISTI_FOOT_LOOKS = 5,
-       DISTI_FOOT_LEAVES = 8 * 8 * 8 * 8, DISTI_FOOT_CELLS = 2 * DISTI_FOOT_LEAVES, DISTI_FOOT_NEWTON = 12,
+       DISTI_FOOT_LEAVES = 8 * 8 * 8 * 8, DISTI_FOOT_CELLS = 2 * DISTI_FOOT_LEAVES, DISTI_FOOT_NEWTON = 18,
        DISTI_FOOT_BLOCK = 32, DISTI_FOOT_AHEAD = 64 };
 
 /* Of a way to a point as far off as a float can say, whose square it cannot. */
@@ -12144,7 +12144,7 @@ static int disti_foot_told(const disti_foot_tree *tree, int number, float f, con
     if (cell->steps++ == 0) cell->empty = finite ? disti_certified_empty(field, size) : 3e38f;
     if (!away) disti_foot_move(field, cell->seed, n, -step);
     for (int i = 0; i < 3; i++) away |= !(fabs((double)cell->seed[i] - center[i]) <= 4.0 * half);
-    cell->on = !away && size <= 0.01f * side * DISTI_MAX(slope, 0.25f);
+    cell->on = !away && size <= 0.002f * side * DISTI_MAX(slope, 0.25f); /* of a decoder f is nearly 0 in some places */
     for (int i = 0; i < 3 && cell->on; i++)
         cell->normal[i] = (signed char)(127.0f * n[i] + (n[i] < 0.0f ? -0.5f : 0.5f));
     cell->done = number < DISTI_FOOT_LEAVES || (double)cell->empty >= 1.7321 * half || cell->on || away ||

@@ -472,7 +472,7 @@ TEST(fields_far_from_the_origin_are_found_to_within_what_floats_can_tell)
 enum { SURFACE = 2 * RAYS };
 static float surface[3 * SURFACE];
 
-/* Points of the surface, found by tracing: as many as the array has room for, or as 8 (quick: 1) times RAYS rays hit. */
+/* Points of the surface: as many as the array has room for, or as 8 (quick: 1) times RAYS rays hit. */
 static int surface_sample(const dist_field *field, dist_context *ctx)
 {
     test_random random = test_random_seed(5);

@@ -402,7 +402,9 @@ enum {
    file in F32, four times one in 16 bits, and up to 32 bytes more for each input of a layer; no more on the way. */
 DIST_API dist_net *dist_net_load(dist_context *ctx, const void *bytes, size_t size);
 #ifndef DIST_NO_STDIO
-/* A file of at most 2 GB; a sentence about it ends with its path. */
+/* A file of at most 2 GB; a sentence about it ends with its path. Saving, of pictures and meshes too, writes over what
+   stands there: where it fails (a full disk) that is gone and what is left is cut off, so save what you cannot make
+   again under another name and rename it. */
 DIST_API dist_net *dist_net_load_file(dist_context *ctx, const char *path);
 DIST_API dist_status dist_net_save_file(dist_context *ctx, const dist_net *net, const char *path);
 #endif

@@ -183,6 +183,11 @@ if [ -z "$quick" ]; then
     else
         skip_row wasm "clang for WebAssembly, wasi-libc and node are not all installed"
     fi
+    if can gcc -fsanitize=thread && setarch -R build/matrix/probe 2>/dev/null; then # at addresses that it can follow
+        row threads build/matrix/threads gcc "-O2 -g1 -fsanitize=thread" "" 1 "setarch -R" test_threads
+    else
+        skip_row threads "gcc -fsanitize=thread or setarch -R does not work here"
+    fi
     wine=$(command -v wine64 || command -v wine || ls /usr/lib/wine/wine64 2>/dev/null)
     if have x86_64-w64-mingw32-gcc && [ -n "$wine" ]; then
         set -- $(basename -s .c tests/test_*.c)

@@ -648,17 +648,17 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
    surface as long as that brings it nearer, then a look around, through the cells of an octree (16 along each side of
    the cube around the bounding sphere) that the figures for how.certified do not show to be empty. Of a distance it is
    as far off as the nearest to within 1e-4 of the radius, but for one to six in a thousand of the points beyond the
-   sphere where parts are small (by up to .014); of a trained decoder to within a 500th but for one in a hundred, or
-   one in 25 (a fox), by up to .013, from far away, too: two parts of the surface in one cell may be taken for one.
-   Where walls are thinner than a cell (a camera's) one in three or four is off by more, one in 15 to 20 by more than a
-   100th, the worst by .04, and of spheres that are in by a 50th one in 50 to 150 is told to be clear. Of a field
-   clamped below a tenth of its radius the cells tell little: a part that is not the nearest, or none, may be what is
-   found. Inside the sphere a distance is asked for 2 samples a point, mostly; a decoder from far away for 40 to 140 a
-   point of some hundred in one call, which share the cells, and for 300 to 2300 of a point alone. A cache spares the
-   cells that it shows to be empty. Of a scene each instance that may be nearest is gone to by itself; what is of one
-   within another is no surface. closest (n, 3); distance (n) signed, below 0 inside, and status (n) may be NULL:
-   DIST_RAY_HIT, DIST_RAY_UNRESOLVED (no surface found: the last point tried), DIST_RAY_NOT_FINITE. Nothing is asked
-   outside the bounding sphere. */
+   sphere where parts are small (by up to .014); of a trained decoder to within a 500th but for one in 80, or one in 25
+   (a fox), by up to .013, from far away, too: two parts of the surface in one cell may be taken for one. Where walls
+   are thinner than a cell (a camera's) more than one in four is off by more, one in 18 by more than a 100th, the worst
+   by .04, and of spheres that are in by a 50th one in 130, or more beside the bounding sphere, is told to be clear. Of
+   a field clamped below a tenth of its radius the cells tell little: a part that is not the nearest, or none, may be
+   what is found. Inside the sphere a distance is asked for 2 samples a point, mostly; a decoder from far away for 40
+   to 140 a point of some hundred in one call, which share the cells, and for 300 to 2300 of a point alone. A cache
+   spares the cells that it shows to be empty. Of a scene each instance that may be nearest is gone to by itself; what
+   is of one within another is no surface. closest (n, 3); distance (n) signed, below 0 inside, and status (n) may be
+   NULL: DIST_RAY_HIT, DIST_RAY_UNRESOLVED (no surface found: the last point tried), DIST_RAY_NOT_FINITE. Nothing is
+   asked outside the bounding sphere. */
 DIST_API dist_status dist_field_closest_point(dist_context *ctx, const dist_field *field, size_t n,
                                               const float *points, float *closest, float *distance,
                                               unsigned char *status);

@@ -46,20 +46,41 @@ DNNL = $(call installed,dnnl.h,-DWITH_DNNL,-ldnnl)
 
 all: $(PROGRAMS) $(BENCHES)
 
-build/bench_blas: bench/bench_blas.c dist.h $(wildcard examples/*.h bench/*.h)
-	$(CC) $(CFLAGS) $(STRICT) $(OPENMP) $< -o $@ $(CBLAS) $(DNNL) -lm
+# Programs are linked with one translation of the library, which takes fifteen seconds: the one that each of them asks
+# for, so that it compiles alone as well, is kept out by DIST_IMPLEMENTED. Those that look inside or leave something out
+# hold their own.
+LIBRARY = build/dist.o
+HEADERS = dist.h $(wildcard examples/*.h bench/*.h)
+COMPILE = $(CC) $(CFLAGS) $(STRICT) $(OPENMP) $(STB)
+OWN = $(addprefix build/bench_,grow net step work_precision)
 
-build/blas: examples/blas.c dist.h $(wildcard examples/*.h)
-	$(CC) $(CFLAGS) $(STRICT) $(OPENMP) $< -o $@ $(CBLAS) -lm
+$(LIBRARY): dist.h
+	@mkdir -p build
+	$(CC) $(CFLAGS) $(STRICT) $(OPENMP) -DDIST_IMPLEMENTATION -x c -c $< -o $@
 
-build/scheduler: examples/scheduler.c dist.h $(wildcard examples/*.h)
-	$(CC) $(CFLAGS) $(STRICT) $(OPENMP) -pthread $< -o $@ -lm
+build/bench_blas: bench/bench_blas.c $(HEADERS)
+	$(COMPILE) $< -o $@ $(CBLAS) $(DNNL) -lm
 
-build/%: examples/%.c dist.h $(wildcard examples/*.h) | build/stb/done
-	$(CC) $(CFLAGS) $(STRICT) $(OPENMP) $(STB) $< -o $@ -lm
+$(OWN): build/%: bench/%.c $(HEADERS) | build/stb/done
+	$(COMPILE) $< -o $@ -lm
 
-build/%: bench/%.c dist.h $(wildcard examples/*.h bench/*.h) | build/stb/done
-	$(CC) $(CFLAGS) $(STRICT) $(OPENMP) $(STB) $< -o $@ -lm
+build/arena: examples/arena.c $(HEADERS) | build/stb/done
+	$(COMPILE) $< -o $@ -lm
+
+build/blas: examples/blas.c $(LIBRARY) $(HEADERS)
+	$(COMPILE) -DDIST_IMPLEMENTED $< $(LIBRARY) -o $@ $(CBLAS) -lm
+
+build/scheduler: examples/scheduler.c $(LIBRARY) $(HEADERS)
+	$(COMPILE) -DDIST_IMPLEMENTED -pthread $< $(LIBRARY) -o $@ -lm
+
+build/results_photos: examples/fit_photos.c
+build/results_pose: examples/fit_pose.c
+
+build/%: examples/%.c $(LIBRARY) $(HEADERS) | build/stb/done
+	$(COMPILE) -DDIST_IMPLEMENTED $< $(LIBRARY) -o $@ -lm
+
+build/%: bench/%.c $(LIBRARY) $(HEADERS) | build/stb/done
+	$(COMPILE) -DDIST_IMPLEMENTED $< $(LIBRARY) -o $@ -lm
 
 # Tests are linked with one translation of the library, which takes fifteen seconds; those of its inside hold it themselves.
 $(TEST_DIR)/test_%: tests/test_%.c $(TEST_DIR)/inside.o $(wildcard tests/*.h examples/*.h bench/*.h)

@@ -94,11 +94,11 @@ enum {
 DIST_API const char *dist_version(void);
 
 /* Memory. alloc_fn returns `bytes` bytes aligned to `alignment` (a power of two, at most 64) or NULL; free_fn gets the
-   same pointer and size back, never NULL. Called by create, load, save and destroy functions, those that make meshes
-   or measure them, dist_shape_set_texture, dist_net_set_half and, for a field of your own or an analytic one, by the
-   first call but dist_render_backward that wants the gradient of its code or color; by no other. Like every hook, it
-   may use this library with other contexts than the one that calls it. Either both functions or none; none: malloc and
-   free. */
+   same pointer and size back, never NULL. Called by create, load, save, free and destroy functions, those that make
+   meshes, sample or measure them, dist_shape_set_texture, dist_net_set_half and, for a field of your own or an analytic
+   one, by the first call but dist_render_backward that wants the gradient of its code or color; by no other. Like every
+   hook, it may use this library with other contexts than the one that calls it. Either both functions or none; none:
+   malloc and free. */
 typedef struct dist_allocator {
     void *user;
     void *(*alloc_fn)(void *user, size_t bytes, size_t alignment);
@@ -149,7 +149,8 @@ enum {
 };
 
 typedef struct dist_context_desc {
-    int workers; /* threads to use at most; 0: as many as OpenMP would, 1 without OpenMP. Required with a scheduler */
+    int workers; /* threads to use at most, up to 1024; 0: as many as OpenMP would, 1 without OpenMP. Required with a
+                    scheduler */
     int isa; /* DIST_ISA_*; one that the processor lacks is refused. Bits are the same on all machines for one isa */
     dist_allocator allocator;
     dist_scheduler scheduler;
@@ -225,8 +226,9 @@ typedef struct dist_field {
        takes it for everything; gradients are the exact ones. Set by dist_shape_field after dist_net_set_half. */
     void (*coarse_fn)(void *user, int worker, size_t n, const float *points, float *sdf, float *gradient);
     float coarse_error;
-    /* bounding sphere: the surface lies inside it, nothing is looked for outside, nor is f asked for there, but by
-       DIST_TRACE_PAPER and, in the corners of its cube, dist_mesh_extract */
+    /* bounding sphere: the surface lies inside it, nothing is looked for outside, nor is f asked for there, but for
+       rounding, a 1e-6 of the radius, by DIST_TRACE_PAPER, in the corners of its cube by dist_mesh_extract, and by
+       differences, how.normal_delta beyond a hit */
     float center[3];
     float radius;    /* 1e-15 to 1e15 */
     /* bound or estimate of |grad f| where 0 < f < lipschitz_within. 0: 1, as distances have it: of a field of your own
@@ -257,10 +259,11 @@ typedef struct dist_field {
        the scene's. Set by dist_shape_field and dist_scene_field; NULL: nobody else's */
     const void *weights_of, *color_weights_of;
     dist_context *owner; /* the context that made it; NULL: any */
-    /* a number that goes by what user points to, so that a cache or a tape of what it was is refused. Set by
-       dist_shape_field and dist_scene_field, whose functions give 0 where eval_fn is not theirs any more; NULL: that is
-       not looked at */
+    /* a number that goes by what user points to, so that a cache or a tape of what it was is refused. The library's
+       own fields have it, whose functions give 0 where eval_fn is not theirs any more; NULL: that is not looked at */
     unsigned (*changes_fn)(const struct dist_field *field);
+    /* likewise by what only color goes by: where d_out.color is given, a tape of what it was is refused */
+    unsigned (*color_changes_fn)(const struct dist_field *field);
     /* what is out of date, of the DISTI_STALE_* bits asked for: then it is refused. Set likewise */
     int (*stale_fn)(const struct dist_field *field, int what);
     unsigned taken; /* then: how many textures the shape had got, or what the scene's instances were. Set likewise */
@@ -270,7 +273,8 @@ typedef struct dist_field {
 /* f = distance to a sphere, to a torus around the y axis, to an axis-aligned box (half extents), exact; each within its
    bounding sphere. Their code is the list of numbers given, in that order, so that gradients can be tried on them.
    A torus's distance is exact where the tube is no wider than the ring.
-   The arrays are borrowed while the field is used. A size below 0 becomes field.radius, which every call refuses. */
+   The arrays are borrowed while the field is used; once their numbers have changed take the field anew: its sphere goes
+   by them. A size below 0 becomes field.radius, which every call refuses. */
 DIST_API dist_field dist_field_sphere(const float center_radius[4]);
 DIST_API dist_field dist_field_torus(const float center_radii[5]); /* x y z, ring radius, tube radius */
 DIST_API dist_field dist_field_box(const float center_half[6]);    /* x y z, half extents */
@@ -312,8 +316,8 @@ DIST_API dist_status dist_field_backward(dist_context *ctx, const dist_field *fi
 
 /* Adjoint of dist_color_eval: with L = sum_i d_color[i] . color(points[i]), d_color (n, 3), adds dL/dpoint to d_points
    (n, 3) unless NULL, and dL/dcode, dL/d(color code), dL/dweights of the net that gives the color to grads: its weights
-   are grads->color_weights where it is a texture, grads->weights where it is the shape's own net.
-   What grads holds of the camera must be NULL. */
+   are grads->color_weights where it is a texture, grads->weights where it is the shape's own net. Points that are not
+   finite, or whose d_color is not, add nothing. What grads holds of the camera must be NULL. */
 DIST_API dist_status dist_color_backward(dist_context *ctx, const dist_field *field, size_t n, const float *points,
                                          const float *d_color, float *d_points, const dist_gradients *grads);
 
@@ -352,13 +356,14 @@ typedef struct dist_instance {
    the scene's. Every point is held against every sphere: fast up to some hundred instances; more are better made scenes
    of scenes. Belongs to the context that made it. */
 typedef struct dist_scene dist_scene;
-/* NULL on failure. Instances may share fields; a scene's field may be an instance of another scene. Takes 264 bytes for
-   each number of the scene's code, for sums of its gradient. */
+/* NULL on failure. count: 1 to 2^20. Instances may share fields; a scene's field may be an instance of another scene.
+   Takes 264 bytes for each number of the scene's code, for sums of its gradient. */
 DIST_API dist_scene *dist_scene_create(dist_context *ctx, int count, const dist_instance *instances);
 DIST_API void dist_scene_destroy(dist_scene *scene);
-/* Moves an instance or replaces its field (NULL: it stays) by one whose code is as long and that has a color if the old
-   one had. No allocator call. Take dist_scene_field again afterwards, and set it in a scene that holds this one: the
-   bounding sphere changes, and where the weights stand. A field whose sphere an instance has left is refused. */
+/* Moves an instance or replaces its field (NULL: it stays) by one whose code is as long and that has of color, its code
+   and its adjoint what the old one had. No allocator call. Take dist_scene_field again afterwards, and set it in a
+   scene that holds this one: the bounding sphere changes, and where the weights stand. A field whose sphere an instance
+   has left is refused. */
 DIST_API dist_status dist_scene_set(dist_scene *scene, int index, const dist_instance *instance);
 /* The scene as a field. Borrows the scene. Its code is, for each instance, its field's code (nothing if that has no
    adjoint), then its placement as dist_similarity_move has it: log-scale, w of R' = exp([w]x) R, translation;
@@ -399,7 +404,8 @@ enum {
 
 /* Reads a model in safetensors form; tensor names and metadata as the README's "Model files" says. The bytes are
    copied. A file is hostile until proved otherwise: NULL and a sentence for anything that does not fit. Takes twice a
-   file in F32, four times one in 16 bits, and up to 32 bytes more for each input of a layer; no more on the way. */
+   file in F32, four times one in 16 bits, and up to 32 bytes more for each input of a layer and 4 KB; no more on the
+   way. */
 DIST_API dist_net *dist_net_load(dist_context *ctx, const void *bytes, size_t size);
 #ifndef DIST_NO_STDIO
 /* A file of at most 2 GB; a sentence about it ends with its path. Saving, of pictures and meshes too, writes over what
@@ -586,7 +592,7 @@ typedef struct dist_render_desc {
                             steepest slopes sampled, dist_stats.steepest says when these were too small */
     /* dist_trace only. any_hit 1: a ray ends as soon as anything is certain to block it, for shadows; its distance is
        then that of a sample inside what blocks, its error how far before that it goes in. max_distance: how far a ray
-       looks, in lengths of its direction (1: from origin to origin + direction); 0: without end */
+       looks, in lengths of its direction (1: from origin to origin + direction); 0 or INFINITY: without end */
     int any_hit;
     float max_distance;
     int warm_start;      /* 1: start from the picture in the tape, see dist_tape_create; guarded tracer, pictures */
@@ -657,8 +663,8 @@ DIST_API dist_status dist_trace(dist_context *ctx, const dist_field *field, size
    to 140 a point of some hundred in one call, which share the cells, and for 300 to 2300 of a point alone. A cache
    spares the cells that it shows to be empty. Of a scene each instance that may be nearest is gone to by itself; what
    is of one within another is no surface. closest (n, 3); distance (n) signed, below 0 inside, and status (n) may be
-   NULL: DIST_RAY_HIT, DIST_RAY_UNRESOLVED (no surface found: the last point tried), DIST_RAY_NOT_FINITE. Nothing is
-   asked outside the bounding sphere. */
+   NULL: DIST_RAY_HIT, DIST_RAY_UNRESOLVED (no surface found: the last point tried), DIST_RAY_NOT_FINITE (closest is
+   the point, distance 3e38). Nothing is asked outside the bounding sphere. */
 DIST_API dist_status dist_field_closest_point(dist_context *ctx, const dist_field *field, size_t n,
                                               const float *points, float *closest, float *distance,
                                               unsigned char *status);
@@ -671,7 +677,7 @@ DIST_API dist_status dist_field_closest_point(dist_context *ctx, const dist_fiel
    what it saves: from a quarter to three quarters of the rays' queries. Belongs to the context that made it. */
 typedef struct dist_cache dist_cache;
 /* resolution: cells along each side of the cube around the bounding sphere, a multiple of 8 to 512; 0: 64. Takes
-   resolution^3 bytes, and about 8 resolution^2 queries to make. NULL on failure. */
+   resolution^3 bytes, and 8 to 14 resolution^2 queries to make. NULL on failure. */
 DIST_API dist_cache *dist_cache_create(dist_context *ctx, const dist_field *field, int resolution);
 DIST_API void dist_cache_destroy(dist_cache *cache);
 /* The field with its cache, to be traced instead of it. Borrows both. As soon as the shape's code, the net's weights or
@@ -689,8 +695,9 @@ DIST_API unsigned long long dist_cache_queries(const dist_cache *cache);
 typedef struct dist_contact {
     float depth;     /* how far the sphere is in; below 0: they are at least so far apart, as far as that is exact */
     float normal[3]; /* unit, out of the field: moving the sphere by depth * normal ends the contact; 0 without one */
-    float point[3];  /* of the surface, the deepest in the sphere */
-    int status;      /* DIST_RAY_HIT: they touch; DIST_RAY_MISS; else as dist_field_closest_point */
+    float point[3];  /* of the surface, the deepest in the sphere; the sphere's center where there is no contact */
+    int status;      /* DIST_RAY_HIT: they touch; DIST_RAY_MISS; else as dist_field_closest_point, NOT_FINITE also where
+                        the sphere is not finite */
 } dist_contact;
 
 /* n spheres (n, 4), center and radius (below 0: refused), against the field. A sphere that is clear of it, by the
@@ -887,7 +894,7 @@ DIST_API dist_status dist_mesh_backward(dist_context *ctx, const dist_field *fie
                                         const float *d_vertices, const dist_gradients *grads);
 #endif
 
-/* n points (n, 3), uniform over the area, the same for the same seed. Refused: an empty mesh, one whose area is not
+/* n points (n, 3), uniform over the area, the same for the same seed. Refused: a mesh whose area is 0 or not
    finite, an index out of range. */
 DIST_API dist_status dist_mesh_sample(dist_context *ctx, const dist_mesh *mesh, unsigned seed, size_t n, float *points);
 
@@ -4062,6 +4069,18 @@ static void disti_turn(const float w[3], float m[9])
     for (int i = 0; i < 9; i++) m[i] = (float)r[i];
 }
 
+/* Of bytes in words of 4, those that are left over aside; it goes on from `hash`. */
+static unsigned disti_hash(unsigned hash, size_t bytes, const void *data)
+{
+    uint32_t h = hash ^ 2166136261u, word;
+    for (size_t i = 0; i + 4 <= bytes; i += 4) {
+        memcpy(&word, (const unsigned char *)data + i, sizeof word);
+        h = (h ^ word) * 2654435761u;
+        h ^= h >> 15;
+    }
+    return h;
+}
+
 /* Analytic fields: f, grad f and the adjoint for the numbers they are made of, in one function each; q = p - center.
    At the few points where |q| or the like is 0 the gradient is 0. */
 static float disti_length(float x, float y, float z)
@@ -4094,6 +4113,7 @@ static void disti_torus_point(const float *c, const float *p, float *f, float *g
     float inverse = length > 0.0f ? 1.0f / length : 0.0f;
     float inverse_ring = ring > 0.0f ? 1.0f / ring : 0.0f;
     *f = length - c[4];
+    if (!disti_finite(length)) h = 0.0f; /* so far off that squares are not */
     g[0] = h * inverse * q[0] * inverse_ring;
     g[1] = q[1] * inverse;
     g[2] = h * inverse * q[2] * inverse_ring;
@@ -4167,6 +4187,10 @@ static void disti_analytic_adjoint(disti_point_fn point_fn, int size, void *user
         (void)worker;                                                                                                  \
         disti_analytic_adjoint(disti_##name##_point, size, user, n, points, d_sdf, d_code);                            \
     }                                                                                                                  \
+    static unsigned disti_##name##_changes(const dist_field *field)                                                    \
+    {                                                                                                                  \
+        return field->eval_fn == disti_##name##_eval ? disti_hash(0, size * sizeof(float), field->user) : 0;           \
+    }                                                                                                                  \
     DIST_API dist_field dist_field_##name(const float c[size])                                                         \
     {                                                                                                                  \
         dist_field field;                                                                                              \
@@ -4180,6 +4204,7 @@ static void disti_analytic_adjoint(disti_point_fn point_fn, int size, void *user
         field.user = user.out;                                                                                         \
         field.eval_fn = disti_##name##_eval;                                                                           \
         field.adjoint_fn = disti_##name##_adjoint;                                                                     \
+        field.changes_fn = disti_##name##_changes;                                                                     \
         memcpy(field.center, c, sizeof field.center);                                                                  \
         field.radius = 1.1f * (extent);                                                                                \
         for (int i = 3; i < size; i++)                                                                                 \
@@ -4214,6 +4239,11 @@ static unsigned disti_changes(const dist_field *field)
     return field->changes_fn ? field->changes_fn(field) : 0;
 }
 
+static unsigned disti_color_changes(const dist_field *field)
+{
+    return field->color_changes_fn ? field->color_changes_fn(field) : 0;
+}
+
 /* What a field may be too old for. COLOR: the shape, or one of the scene's, has got another texture since it was taken;
    COUNT: the scene's weights have become more or fewer since then; FOLD and PAINT: the net's weights, or those of the
    net that colors it, have changed since dist_shape_set_code; SPHERE: an instance has left the sphere since. A shape or
@@ -4229,18 +4259,6 @@ enum {
 static int disti_stale(const dist_field *field, int what)
 {
     return field->stale_fn ? field->stale_fn(field, what) : 0;
-}
-
-/* Of bytes in words of 4, those that are left over aside; it goes on from `hash`. */
-static unsigned disti_hash(unsigned hash, size_t bytes, const void *data)
-{
-    uint32_t h = hash ^ 2166136261u, word;
-    for (size_t i = 0; i + 4 <= bytes; i += 4) {
-        memcpy(&word, (const unsigned char *)data + i, sizeof word);
-        h = (h ^ word) * 2654435761u;
-        h ^= h >> 15;
-    }
-    return h;
 }
 
 /* The figure from |f| = disti_far_from on. */
@@ -4403,9 +4421,16 @@ static void disti_color_task(void *arg, int index, int worker)
         return;
     }
     double *d_code = job->slots + (size_t)index * ((size_t)field->code_size + (size_t)field->color_code_size);
-    field->color_adjoint_fn(field->user, worker, n, points, job->d_color + 3 * first,
-                            job->d_points ? job->d_points + 3 * first : NULL, job->code ? d_code : NULL,
-                            job->color_code ? d_code + field->code_size : NULL);
+    const float *d_color = job->d_color + 3 * first;
+    float *d_points = job->d_points ? job->d_points + 3 * first : NULL;
+    for (size_t i = 0, run = 0; i <= n; i++) { /* of points that are finite, and whose colors' seeds are */
+        if (i < n && disti_finite_all(3, d_color + 3 * i) && disti_finite_all(3, points + 3 * i)) continue;
+        if (i > run)
+            field->color_adjoint_fn(field->user, worker, i - run, points + 3 * run, d_color + 3 * run,
+                                    d_points ? d_points + 3 * run : NULL, job->code ? d_code : NULL,
+                                    job->color_code ? d_code + field->code_size : NULL);
+        run = i + 1;
+    }
 }
 
 /* What makes a field's color unusable; fields without a distance are welcome here. */
@@ -5743,6 +5768,18 @@ static unsigned disti_scene_changes(const dist_field *field)
     return hash;
 }
 
+static unsigned disti_scene_color_changes(const dist_field *field)
+{
+    if (field->color_fn != disti_scene_color) return 0;
+    const dist_scene *scene = (const dist_scene *)field->user;
+    unsigned hash = 0;
+    for (int k = 0; k < scene->count; k++) {
+        unsigned own = disti_color_changes(&scene->placed[k].field);
+        hash = disti_hash(hash, sizeof own, &own);
+    }
+    return hash;
+}
+
 /* Whether a ball lies in the field's sphere, but for rounding. */
 static int disti_ball_within(const disti_ball *ball, const dist_field *field)
 {
@@ -5782,6 +5819,7 @@ DIST_API dist_field dist_scene_field(dist_scene *scene)
     field = disti_scene_plain(scene);
     field.owner = scene->ctx;
     field.changes_fn = disti_scene_changes;
+    field.color_changes_fn = disti_scene_color_changes;
     field.stale_fn = disti_scene_stale;
     field.taken = scene->changes;
     field.lipschitz = field.lipschitz_far = 1.0f; /* phi outside the spheres, however flat the instances are */
@@ -5867,10 +5905,15 @@ static void disti_scene_find_task(void *arg, int index, int worker)
 DIST_API dist_status dist_scene_find(dist_scene *scene, size_t n, const float *points, int *index)
 {
     if (!scene) return DIST_BAD_ARGUMENT;
-    if (n == 0) return DIST_OK;
+    dist_status status = disti_enter(scene->ctx, "dist_scene_find");
+    if (status == DIST_OK) status = disti_count_check(scene->ctx, n, "dist_scene_find");
+    if (status != DIST_OK || n == 0) return status;
     if (!points || !index) return disti_refuse(scene->ctx, "dist_scene_find: %s is NULL", points ? "index" : "points");
-    dist_status status = disti_count_check(scene->ctx, n, "dist_scene_find");
-    if (status != DIST_OK) return status;
+    for (int k = 0; k < scene->count; k++)
+        if (disti_stale(&scene->placed[k].field, DISTI_STALE_FOLD))
+            return disti_fail(scene->ctx, DIST_BAD_ARGUMENT, "%s: the weights of instance %d's net have changed since "
+                                                             "dist_shape_set_code; call it again", "dist_scene_find",
+                              k, 0);
     disti_scene_job job = {scene, disti_cut(n, DISTI_SCENE_CHUNK, 1u << 20), points, index};
     disti_run(scene->ctx, job.pieces.count, disti_scene_find_task, &job);
     return DIST_OK;
@@ -8559,6 +8602,13 @@ static unsigned disti_shape_changes(const dist_field *field)
     return disti_hash(shape->changes, sizeof of, of);
 }
 
+static unsigned disti_shape_color_changes(const dist_field *field)
+{
+    if (field->color_fn != disti_shape_color_fn) return 0;
+    const dist_shape *shape = (const dist_shape *)field->user, *paint = shape->texture ? shape->texture : shape;
+    return disti_hash(paint->changes, sizeof paint->net->changes, &paint->net->changes);
+}
+
 static int disti_shape_stale(const dist_field *field, int what)
 {
     int is_own = field->eval_fn == disti_shape_eval_fn || (field->coarse_fn && field->eval_fn == field->coarse_fn);
@@ -8584,6 +8634,7 @@ DIST_API dist_field dist_shape_field(dist_shape *shape)
     field.user = shape;
     field.owner = shape->ctx;
     field.changes_fn = disti_shape_changes;
+    field.color_changes_fn = disti_shape_color_changes;
     field.stale_fn = disti_shape_stale;
     field.taken = shape->textures;
     if (net->sdf_channel >= 0) {
@@ -8835,6 +8886,9 @@ DIST_API dist_status dist_shape_eval(dist_context *ctx, dist_shape *shape, size_
     status = disti_count_check(ctx, n, "dist_shape_eval");
     if (status != DIST_OK || n == 0) return status;
     if (!points || !channels) return disti_refuse(ctx, "dist_shape_eval: %s is NULL", points ? "channels" : "points");
+    if (shape->folded != shape->net->changes)
+        return disti_refuse(ctx, "%s: the weights of the shape's net have changed since dist_shape_set_code; call it "
+                                 "again", "dist_shape_eval");
     disti_channels_job job = {shape, disti_cut(n, 8 * DISTI_BLOCK, 1u << 20), points, channels};
     disti_run(ctx, job.pieces.count, disti_channels_task, &job);
     return DIST_OK;
@@ -9134,18 +9188,31 @@ static dist_status disti_loader_fail(disti_loader *loader, dist_status status, c
     return loader->status;
 }
 
-static dist_status disti_loader_bad(disti_loader *loader, const char *key)
+/* want: what it must be. */
+static dist_status disti_loader_bad(disti_loader *loader, const char *key, const char *want)
 {
     const char *value = disti_archive_meta(&loader->archive, key);
-    unsigned char text[160];
+    unsigned char text[320];
     disti_writer w = {text, 0};
     disti_put_text(&w, key);
     disti_put_text(&w, " is \"");
     disti_put(&w, value ? value : "", value ? DISTI_MIN(strlen(value), (size_t)80) : 0);
-    disti_put(&w, "\"", 2);
-    return disti_loader_fail(loader, DIST_BAD_FILE,
-                             "dist_net_load: metadata %s, which is not one of the values it can have",
-                             (const char *)text, 0, 0);
+    disti_put_text(&w, "\", must be ");
+    disti_put(&w, want, strlen(want) + 1);
+    return disti_loader_fail(loader, DIST_BAD_FILE, "dist_net_load: metadata %s", (const char *)text, 0, 0);
+}
+
+/* kind: of number. */
+static void disti_loader_beyond(disti_loader *loader, const char *key, const char *kind, double low, double high)
+{
+    unsigned char want[96];
+    disti_writer w = {want, 0};
+    disti_put_text(&w, kind);
+    disti_put_number(&w, low, 6);
+    disti_put_text(&w, " to ");
+    disti_put_number(&w, high, 6);
+    disti_put(&w, "", 1);
+    disti_loader_bad(loader, key, (const char *)want);
 }
 
 /* A number at **s, or failure; advances. */
@@ -9165,7 +9232,7 @@ static double disti_loader_number(disti_loader *loader, const char *key, double 
 {
     const char *s = disti_archive_meta(&loader->archive, key);
     if (s && (!disti_scan_number(&s, &value) || *s || disti_below(value, low) || value > high))
-        disti_loader_bad(loader, key);
+        disti_loader_beyond(loader, key, "a number from ", low, high);
     return loader->status == DIST_OK ? value : low;
 }
 
@@ -9173,21 +9240,21 @@ static double disti_loader_number(disti_loader *loader, const char *key, double 
 static int disti_loader_whole(disti_loader *loader, const char *key, double low, double high, double value)
 {
     value = disti_loader_number(loader, key, low, high, value);
-    if (value != (int)value) disti_loader_bad(loader, key);
+    if (value != (int)value) disti_loader_beyond(loader, key, "a whole number from ", low, high);
     return (int)value;
 }
 
 /* Index of a metadata value in a |-separated list; absent or none of them: 0. */
 static int disti_loader_choice(disti_loader *loader, const char *key, const char *choices)
 {
-    const char *value = disti_archive_meta(&loader->archive, key), *end = choices;
+    const char *value = disti_archive_meta(&loader->archive, key), *at = choices, *end = choices;
     for (int index = 0; value && end; index++) {
-        if (index > 0) choices = end + 1;
-        end = strchr(choices, '|');
-        size_t length = end ? (size_t)(end - choices) : strlen(choices);
-        if (length == strlen(value) && memcmp(choices, value, length) == 0) return index;
+        if (index > 0) at = end + 1;
+        end = strchr(at, '|');
+        size_t length = end ? (size_t)(end - at) : strlen(at);
+        if (length == strlen(value) && memcmp(at, value, length) == 0) return index;
     }
-    if (value) disti_loader_bad(loader, key);
+    if (value) disti_loader_bad(loader, key, choices);
     return 0;
 }
 
@@ -9208,7 +9275,8 @@ static dist_status disti_loader_activation(disti_loader *loader)
     double other = first;
     good = good && (!sine || *s != ',' || (s++, disti_scan_number(&s, &other)));
     if (!good || *s || disti_below(first, 1e-6) || first > 1e6 || disti_below(other, 1e-6) || other > 1e6)
-        return disti_loader_bad(loader, "dist.activation");
+        return disti_loader_bad(loader, "dist.activation", "relu|elu|softplus|softplus:BETA|sine|sine:OMEGA|"
+                                                           "sine:FIRST,OTHERS|tanh|none, numbers from 1e-6 to 1e6");
     net->first_scale = (float)first;
     net->scale = (float)other;
     return DIST_OK;
@@ -9234,7 +9302,7 @@ static dist_status disti_loader_channels(disti_loader *loader)
         if (!*s) return DIST_OK;
         s++;
     }
-    return disti_loader_bad(loader, "dist.channels");
+    return disti_loader_bad(loader, "dist.channels", "1 to 16 names of up to 7 characters, with commas between");
 }
 
 /* A misspelled key would be one that is absent. */
@@ -9269,7 +9337,7 @@ static dist_status disti_loader_meta(disti_loader *loader)
     net->levels = encoding ? levels : 0;
     net->raw = encoding ? raw : 1;
     net->order = disti_loader_choice(loader, "dist.encoding.order", "sin,cos|cos_all,sin_all|sin_all,cos_all");
-    net->base = disti_loader_number(loader, "dist.encoding.base", 1e-6, 1e6, 3.14159265358979323846);
+    net->base = disti_loader_number(loader, "dist.encoding.base", 1e-6, 1e9, 3.14159265358979323846);
     net->normed = disti_loader_choice(loader, "dist.norm", "none|layer");
     net->norm_epsilon = (float)disti_loader_number(loader, "dist.norm.epsilon", 0, 1, 1e-5);
     net->level = (float)disti_loader_number(loader, "dist.level", -1e6, 1e6, 0);
@@ -9340,12 +9408,29 @@ static const char *disti_loader_ending(const disti_loader *loader, const char *n
     return c == digits ? NULL : *digits == '0' && c > digits + 1 ? "" : c;
 }
 
-/* What a layer has that is not understood, or twice, must not be left out without a word; nor a normalization, unless
-   the metadata say that there is none. */
+static const char disti_linear_endings[6][36] = {".weight",   ".bias",
+                                                 ".weight_g", ".weight_v",
+                                                 ".parametrizations.weight.original0",
+                                                 ".parametrizations.weight.original1"};
+
+/* Layer k has no weight: is one half of a pair there? */
+static dist_status disti_loader_half(disti_loader *loader, int k)
+{
+    for (int j = 2; j < 6; j++) {
+        const disti_tensor *half = disti_loader_find(loader, "lin", k, disti_linear_endings[j]);
+        if (half)
+            return disti_loader_fail(loader, DIST_BAD_FILE, "dist_net_load: tensor %s is one of a weight-norm pair, "
+                                     ".weight_g and .weight_v or .original0 and .original1; the other is missing",
+                                     half->name, 0, 0);
+    }
+    return DIST_OK;
+}
+
+/* What a layer has that is not understood, or twice, must not be left out without a word; nor what is behind the last
+   layer, nor a normalization, unless the metadata say that there is none. */
 static dist_status disti_loader_strangers(disti_loader *loader)
 {
-    static const char known[6][36] = {".weight", ".bias", ".weight_g", ".weight_v",
-                                      ".parametrizations.weight.original0", ".parametrizations.weight.original1"};
+    const char(*known)[36] = disti_linear_endings;
     int told = disti_archive_meta(&loader->archive, "dist.norm") != NULL, last = loader->net->layers - 1, k;
     for (size_t i = 0; i < loader->archive.tensor_count; i++) {
         const char *name = loader->archive.tensors[i].name, *ending = disti_loader_ending(loader, name, "lin", &k);
@@ -9354,6 +9439,9 @@ static dist_status disti_loader_strangers(disti_loader *loader)
         if (ending && !found)
             return disti_loader_fail(loader, DIST_UNSUPPORTED, "dist_net_load: tensor %s is of a layer, which has "
                                      ".weight, or a weight-norm pair, and .bias", name, 0, 0);
+        if (ending && k > last)
+            return disti_loader_fail(loader, DIST_BAD_FILE, "dist_net_load: tensor %s is there, but no weight of "
+                                     "layer %d", name, last + 1, 0);
         ending = disti_loader_ending(loader, name, "norm", &k);
         if (!ending) ending = disti_loader_ending(loader, name, "bn", &k);
         if (!ending || (told && !loader->net->normed)) continue;
@@ -9375,6 +9463,15 @@ static dist_status disti_loader_strangers(disti_loader *loader)
     return loader->status;
 }
 
+/* Where the metadata name no channels the first is the distance; the others are c1, c2 and so on. */
+static void disti_loader_unnamed(disti_loader *loader)
+{
+    dist_net *net = loader->net;
+    int out = net->layer[net->layers - 1].out;
+    for (; out <= DISTI_MAX_CHANNELS && net->channels < out; net->channels++)
+        disti_tensor_name((unsigned char *)net->channel_names[net->channels], "", "c", net->channels, "");
+}
+
 /* layers, their in and out, the skips and the code's size, from the tensors' shapes and the metadata. */
 static dist_status disti_loader_shapes(disti_loader *loader)
 {
@@ -9384,13 +9481,18 @@ static dist_status disti_loader_shapes(disti_loader *loader)
     double at;
     loader->prefix = "";
     if (!disti_loader_weight(loader, 0, &gain)) loader->prefix = "module.";
+    if (!disti_loader_weight(loader, 0, &gain)) {
+        if (disti_loader_half(loader, 0) != DIST_OK) return loader->status;
+        loader->prefix = "";
+    }
     for (int k = 0; k < DISTI_MAX_LAYERS; k++) {
         const disti_tensor *w = disti_loader_weight(loader, k, &gain);
+        if (!w && disti_loader_half(loader, k) != DIST_OK) return loader->status;
         if (!w) break;
         if (w->rank != 2 || w->shape[0] < 1 || w->shape[1] < 1 || w->shape[0] > DISTI_MAX_WIDTH ||
             w->shape[1] > 2 * DISTI_MAX_WIDTH)
             return disti_loader_fail(loader, DIST_BAD_FILE,
-                              "dist_net_load: tensor %s must be (out, in) of at most %d by %d", w->name,
+                              "dist_net_load: tensor %s must be (out, in) of 1 to %d by 1 to %d", w->name,
                               DISTI_MAX_WIDTH, 2 * DISTI_MAX_WIDTH);
         net->layer[k].out = (int)w->shape[0];
         net->layer[k].in = (int)w->shape[1];
@@ -9425,25 +9527,29 @@ static dist_status disti_loader_shapes(disti_loader *loader)
     for (int entries = 1; list && *list; entries++) { /* each reads to the list's end: not more than can be */
         if (entries > DISTI_MAX_LAYERS || !disti_scan_number(&list, &at) || !(at >= 1 && at < net->layers) ||
             at != (int)at || (*list && *list != ','))
-            return disti_loader_bad(loader, "dist.skip");
+            return disti_loader_bad(loader, "dist.skip", "layers' numbers from 1 on, with commas between");
         loader->skip[(int)at] = 1;
         if (*list == ',') list++;
     }
+    if (!disti_archive_meta(&loader->archive, "dist.channels")) disti_loader_unnamed(loader);
     if (net->layer[net->layers - 1].out != net->channels)
         return disti_loader_fail(loader, DIST_BAD_FILE,
-                          "dist_net_load: the last layer gives %d numbers, but dist.channels names %d", NULL,
-                          net->layer[net->layers - 1].out, net->channels);
+                                 "dist_net_load: the last layer gives %d numbers, of at most 16, but dist.channels "
+                                 "names %d", NULL, net->layer[net->layers - 1].out, net->channels);
     net->clamp = (float)disti_loader_number(loader, "dist.clamp", 0, 1e6, net->code_size > 0 ? (double)0.1f : 0.0);
     return loader->status;
 }
 
-/* Tensor -> count floats, all finite. */
-static dist_status disti_loader_read(disti_loader *loader, const disti_tensor *tensor, const char *what, int k,
-                                     size_t count, float *out)
+/* Tensor, which is called stem, K, ending, -> count floats, all finite. */
+static dist_status disti_loader_read(disti_loader *loader, const disti_tensor *tensor, const char *stem, int k,
+                                     const char *ending, size_t count, float *out)
 {
     if (loader->status != DIST_OK) return loader->status;
-    if (!tensor)
-        return disti_loader_fail(loader, DIST_BAD_FILE, "dist_net_load: tensor %s of layer %d is missing", what, k, 0);
+    if (!tensor) {
+        char name[96];
+        disti_tensor_name((unsigned char *)name, loader->prefix, stem, k, ending);
+        return disti_loader_fail(loader, DIST_BAD_FILE, "dist_net_load: tensor %s is missing", name, 0, 0);
+    }
     if (tensor->dtype == DISTI_DTYPE_OTHER)
         return disti_loader_fail(loader, DIST_UNSUPPORTED, "dist_net_load: tensor %s must be F32, F16 or BF16",
                           tensor->name, 0, 0);
@@ -9479,18 +9585,21 @@ static dist_status disti_loader_values(disti_loader *loader)
         const disti_tensor *gain, *weight = disti_loader_weight(loader, l, &gain);
         size_t out = (size_t)layer->out, in = (size_t)layer->in;
         float *w = net->params + layer->weight, *bias = net->params + layer->bias;
-        disti_loader_read(loader, weight, "weight", l, out * in, w);
-        if (gain && disti_loader_read(loader, gain, "weight_g", l, out, bias) == DIST_OK)
+        disti_loader_read(loader, weight, "lin", l, ".weight", out * in, w);
+        if (gain && gain->count == out && gain->shape[0] != out)
+            return disti_loader_fail(loader, DIST_UNSUPPORTED, "dist_net_load: tensor %s must be (%d, 1): weight-norm "
+                                     "of dimension 0", gain->name, (double)out, 0);
+        if (gain && disti_loader_read(loader, gain, "lin", l, ".weight_g", out, bias) == DIST_OK)
             disti_weight_norm(out, in, bias, w);
-        disti_loader_read(loader, disti_loader_find(loader, "lin", l, ".bias"), "bias", l, out, bias);
+        disti_loader_read(loader, disti_loader_find(loader, "lin", l, ".bias"), "lin", l, ".bias", out, bias);
         if (!net->normed || l + 1 == net->layers) continue;
-        disti_loader_read(loader, disti_loader_norm(loader, l, ".weight"), "norm weight", l, out,
+        disti_loader_read(loader, disti_loader_norm(loader, l, ".weight"), "norm", l, ".weight", out,
                           net->params + layer->norm_weight);
-        disti_loader_read(loader, disti_loader_norm(loader, l, ".bias"), "norm bias", l, out,
+        disti_loader_read(loader, disti_loader_norm(loader, l, ".bias"), "norm", l, ".bias", out,
                           net->params + layer->norm_bias);
     }
     if (net->code_count == 0) return loader->status;
-    return disti_loader_read(loader, disti_loader_find_codes(loader), "codes", 0,
+    return disti_loader_read(loader, disti_loader_find_codes(loader), "codes", 0, "",
                              (size_t)net->code_count * (size_t)net->code_size, net->codes);
 }
 
@@ -10201,11 +10310,20 @@ typedef struct disti_tracer {
     const dist_field *field;
     dist_render_desc how;
     float lipschitz, epsilon, noise;
+    float usual;      /* epsilon where none is told, as far as the field goes */
     float detail;     /* the field's, or its radius: lengths that are taken on trust go by it */
     float far, ratio; /* from |f| = far on the slope is at most lipschitz / ratio */
     const dist_cache *cache; /* that rays are to use; NULL: none */
     float shy;               /* by how much less than it says a ball of it is trusted: to where |f| is epsilon */
 } disti_tracer;
+
+/* From 3e38 on, infinity included, but no NaN, also for a compiler that knows none. */
+static int disti_endless(float x)
+{
+    uint32_t bits;
+    memcpy(&bits, &x, sizeof bits);
+    return bits >= 0x7f61b1e6u && bits <= 0x7f800000u;
+}
 
 DIST_API dist_render_desc dist_render_desc_resolve(const dist_render_desc *desc)
 {
@@ -10219,13 +10337,14 @@ DIST_API dist_render_desc dist_render_desc_resolve(const dist_render_desc *desc)
     if (how.gradient == DIST_GRADIENT_AUTO)
         how.gradient = how.trace == DIST_TRACE_PAPER ? DIST_GRADIENT_PAPER : DIST_GRADIENT_IMPLICIT;
     if (how.gradient_cap == 0.0f) how.gradient_cap = 0.1f;
+    if (disti_endless(how.max_distance)) how.max_distance = 0.0f;
     return how;
 }
 
 static dist_status disti_how_check(dist_context *ctx, const dist_render_desc *how, const char *function)
 {
     if (!how) return DIST_OK;
-    const double any = 3e38;
+    const double any = 3e38, far = disti_endless(how->max_distance) ? 0.0 : (double)how->max_distance;
     const disti_limit limits[] = {
         {"how.max_steps", (double)how->max_steps, 0, 60000}, {"how.samples", (double)how->samples, 0, 8},
         {"how.trace", (double)how->trace, 0, DIST_TRACE_PAPER},
@@ -10235,7 +10354,7 @@ static dist_status disti_how_check(dist_context *ctx, const dist_render_desc *ho
         {"how.normal_space", (double)how->normal_space, 0, DIST_SPACE_WORLD},
         {"how.inside", (double)how->inside, 0, DIST_INSIDE_EXIT}, {"how.no_cones", (double)how->no_cones, 0, 1},
         {"how.no_prediction", (double)how->no_prediction, 0, 1}, {"how.certified", (double)how->certified, 0, 1},
-        {"how.any_hit", (double)how->any_hit, 0, 1}, {"how.max_distance", (double)how->max_distance, 0, any},
+        {"how.any_hit", (double)how->any_hit, 0, 1}, {"how.max_distance", far, 0, any},
         {"how.warm_start", (double)how->warm_start, 0, 1},
         {"how.step_scale", (double)how->step_scale, 0, 100}, {"how.epsilon", (double)how->epsilon, 0, any},
         {"how.gradient_cap", (double)how->gradient_cap, 0, 1},
@@ -10307,8 +10426,11 @@ static dist_status disti_tracer_init(disti_tracer *tracer, dist_context *ctx, co
     }
     tracer->noise = disti_field_noise(field);
     tracer->epsilon = tracer->how.epsilon;
-    if (field->clamp > 0.0f && tracer->how.trace == DIST_TRACE_GUARDED)
-        tracer->epsilon = DISTI_MIN(tracer->epsilon, 0.5f * field->clamp); /* a clamped f is near nothing */
+    tracer->usual = 5e-5f * tracer->detail;
+    if (field->clamp > 0.0f && tracer->how.trace == DIST_TRACE_GUARDED) { /* a clamped f is near nothing */
+        tracer->epsilon = DISTI_MIN(tracer->epsilon, 0.5f * field->clamp);
+        tracer->usual = DISTI_MIN(tracer->usual, 0.5f * field->clamp);
+    }
     tracer->epsilon = DISTI_MAX(tracer->epsilon, tracer->how.epsilon > 0.0f ? tracer->noise : 0.0f);
     tracer->cache = NULL;
     tracer->shy = DISTI_MAX(tracer->epsilon, 5e-5f * tracer->detail) / tracer->lipschitz;
@@ -10359,17 +10481,12 @@ static void disti_ray_init(const dist_field *field, const double center[3], cons
                     center[2] - (double)field->center[2], direction[0], direction[1], direction[2], footprint, ray);
 }
 
-static float disti_default_epsilon(const disti_tracer *tracer)
-{
-    return 5e-5f * tracer->detail;
-}
-
 /* |f| that counts as the surface at s: epsilon, but no more than half a pixel there, and no less than float's noise. */
 static float disti_ray_epsilon(const disti_tracer *tracer, const disti_ray *ray, float s)
 {
     if (tracer->epsilon > 0.0f) return tracer->epsilon;
     float pixel = (float)(ray->base + (double)s) * ray->footprint;
-    float epsilon = disti_default_epsilon(tracer);
+    float epsilon = tracer->usual;
     epsilon = ray->footprint > 0.0f && pixel < epsilon ? pixel : epsilon;
     return DISTI_MAX(epsilon, tracer->noise);
 }
@@ -10581,7 +10698,7 @@ static float disti_ray_floor(const disti_tracer *tracer, const disti_ray *ray)
    from which the mean slope to a hit is known. */
 static void disti_ray_creeps(const disti_tracer *tracer, disti_ray *ray, disti_sample now, int trusted)
 {
-    float ripple = 10.0f * disti_default_epsilon(tracer);
+    float ripple = 10.0f * tracer->usual;
     if (tracer->how.certified) {
         if (now.f >= 32.0f * tracer->noise) ray->crept = now;
         return;
@@ -10699,7 +10816,7 @@ static int disti_ray_least(const disti_tracer *tracer, disti_ray *ray)
     float epsilon = disti_ray_near(tracer, ray, ray->front.s);
     int flat = DISTI_MAX(ray->a.f, ray->b.f) - ray->front.f < tracer->noise;
     float gentler = DISTI_MIN(left, right);
-    float thin = DISTI_MIN(epsilon, DISTI_MAX(disti_default_epsilon(tracer), tracer->noise));
+    float thin = DISTI_MIN(epsilon, DISTI_MAX(tracer->usual, tracer->noise));
     int narrow = gentler > 0.3f * tracer->lipschitz || (gentler > 0.0f && !flat && ray->b.s - ray->a.s < thin);
     int sheet = narrow && ray->front.f < 0.5f * thin; /* too thin to be sure of */
     if (spent || drop < ray->front.f) {
@@ -11552,7 +11669,7 @@ static void disti_stats_end(dist_context *ctx, const disti_tracer *tracer, dist_
         if (s->error > out->error) out->error = s->error; /* not -0 over 0, which would tell the workers' order */
         if (s->epsilon > 0.0f) out->epsilon = DISTI_MIN(out->epsilon, s->epsilon);
     }
-    if (out->epsilon > 1e38f) out->epsilon = tracer->epsilon > 0.0f ? tracer->epsilon : disti_default_epsilon(tracer);
+    if (out->epsilon > 1e38f) out->epsilon = tracer->epsilon > 0.0f ? tracer->epsilon : tracer->usual;
     out->lipschitz = tracer->lipschitz;
 }
 
@@ -12861,7 +12978,7 @@ static int disti_cone_advance(const disti_tracer *tracer, disti_cone *cone, floa
         cone->least_t = cone->t;
         cone->least_out = cone->out;
     }
-    float margin = tracer->epsilon > 0.0f ? tracer->epsilon : disti_default_epsilon(tracer);
+    float margin = tracer->epsilon > 0.0f ? tracer->epsilon : tracer->usual;
     double radius = (double)disti_empty(tracer, f - margin), out = (double)cone->out, wide = cone->t * cone->sine;
     if (out > 0.0) radius = sqrt(out * out + DISTI_MAX(radius, 0.0) * DISTI_MAX(radius, 0.0));
     if (radius < 1.05 * cone->t * cone->chord || radius <= wide) return DISTI_CONE_BLOCKED;
@@ -13268,7 +13385,7 @@ static void disti_trace_doubt(const disti_tracer *tracer, const disti_tile *tile
         disti_ray *ray = &bench->rays[i];
         float falls = fabsf(ray->slope);
         if (falls < 0.06f * tracer->lipschitz && ray->sign > 0.0f) {
-            float flat = 8.0f * DISTI_MAX(disti_ray_epsilon(tracer, ray, ray->best), disti_default_epsilon(tracer));
+            float flat = 8.0f * DISTI_MAX(disti_ray_epsilon(tracer, ray, ray->best), tracer->usual);
             ray->error = DISTI_MAX(ray->error, flat < farthest * falls ? flat / falls : farthest);
         }
         for (int axis = 0; axis < 2; axis++) {
@@ -14143,7 +14260,7 @@ struct dist_tape {
     int *order;             /* of the tiles: first those that cost most then */
     int tiled;              /* the size of these tiles; 0: there are none */
     int rendered, has_silhouette;
-    unsigned changes;       /* disti_changes of its field then */
+    unsigned changes, color_changes; /* disti_changes of its field then, and the like of its color */
     dist_field field;
     dist_camera camera;
     disti_tracer tracer;
@@ -15887,6 +16004,7 @@ DIST_API dist_status dist_render(dist_context *ctx, const dist_field *field, con
     tape->has_silhouette = job.least;
     tape->field = *field;
     tape->changes = disti_changes(field);
+    tape->color_changes = disti_color_changes(field);
     tape->camera = *camera;
     tape->tracer = tracer;
     tape->tracer.field = &tape->field;
@@ -16375,6 +16493,9 @@ DIST_API dist_status dist_render_backward(dist_context *ctx, const dist_tape *ta
         return disti_refuse(ctx, "%s: d_out.silhouette is given, but out.silhouette was NULL in dist_render", name);
     if (d_out->color) status = disti_color_check(ctx, &tape->field, 1, name);
     if (status != DIST_OK) return status;
+    if (d_out->color && disti_color_changes(&tape->field) != tape->color_changes)
+        return disti_refuse(ctx, "%s: the color's code or weights are not what they were in dist_render; change them "
+                                 "after the backward pass", name);
     memset(&job, 0, sizeof job);
     size_t size = (size_t)tape->field.code_size + (size_t)tape->field.color_code_size, room = ctx->partial_size - 1;
     if (!grads->code && !grads->color_code && !d_out->color) size = 0; /* no code's gradient is summed */

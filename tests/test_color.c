@@ -701,6 +701,90 @@ TEST(color_of_a_field_that_is_older_than_its_texture_is_refused)
     scene_close(&s);
 }
 
+/* A tape of another color: refused where color is asked for, alone and in a scene, and taken again once it is back. */
+TEST(color_gradients_of_another_color_code_or_other_weights_are_refused)
+{
+    static pictures a;
+    static float g[MOST];
+    scene s;
+    float code[8] = {0.1f, -0.2f, 0.3f, 0.4f, -0.5f};
+    scene_open(&s, 0, 1);
+    size_t count = dist_net_weight_count(s.net[1]);
+    float *weights = (float *)malloc(2 * count * sizeof(float));
+    REQUIRE(weights != NULL);
+    for (size_t i = 0; i < count; i++) {
+        weights[i] = dist_net_weights(s.net[1])[i];
+        weights[count + i] = 1.1f * weights[i];
+    }
+    CHECK_STATUS(DIST_OK, dist_shape_set_color_code(s.painted, NULL), s.ctx);
+    dist_instance instance;
+    memset(&instance, 0, sizeof instance);
+    instance.field = &s.field;
+    dist_scene *all = dist_scene_create(s.ctx, 1, &instance);
+    for (int k = 0; k < 2; k++) {
+        if (k) s.field = dist_scene_field(all);
+        dist_tape *tape = pictures_take(&a, &s);
+        dist_gradients grads = gradients_of(&s, g);
+        grads.weights = grads.color_weights = NULL;
+        dist_images plain = a.d_out;
+        plain.color = NULL;
+        for (int what = 0; what < 2; what++)
+            for (int on = 1; on >= 0; on--) {
+                const float *of = weights + (on ? count : 0);
+                if (what) CHECK_STATUS(DIST_OK, dist_net_set_weights(s.ctx, s.net[1], of), s.ctx);
+                CHECK_STATUS(DIST_OK, dist_shape_set_color_code(s.painted, on && !what ? code : NULL), s.ctx);
+                CHECK_STATUS(DIST_OK, dist_render_backward(s.ctx, tape, &plain, &grads), s.ctx);
+                dist_status status = dist_render_backward(s.ctx, tape, &a.d_out, &grads);
+                CHECK_STATUS(on ? DIST_BAD_ARGUMENT : DIST_OK, status, s.ctx);
+                if (on) CHECK_TEXT("the color's code or weights are not what they were", dist_context_message(s.ctx));
+                dist_context_clear(s.ctx);
+            }
+        dist_tape_destroy(tape);
+    }
+    free(weights);
+    dist_scene_destroy(all);
+    scene_close(&s);
+}
+
+/* red = x, whose adjoint hands on what it gets. */
+static void red_color(void *user, int worker, size_t n, const float *points, float *color)
+{
+    (void)user, (void)worker;
+    for (size_t i = 0; i < 3 * n; i++) color[i] = i % 3 ? 0.0f : points[i];
+}
+
+static void red_adjoint(void *user, int worker, size_t n, const float *points, const float *d_color, float *d_points,
+                        double *d_code, double *d_color_code)
+{
+    (void)user, (void)worker, (void)points, (void)d_color_code;
+    for (size_t i = 0; i < n; i++) {
+        if (d_points) d_points[3 * i] += d_color[3 * i];
+        if (d_code) d_code[0] += (double)d_color[3 * i];
+    }
+}
+
+TEST(colors_of_own_fields_lose_no_gradient_to_what_is_not_finite)
+{
+    const float bad[3] = {NAN, INFINITY, -INFINITY};
+    float ball[4] = {0, 0, 0, 0.5f};
+    dist_context *ctx = test_context();
+    dist_field field = dist_field_sphere(ball);
+    field.color_fn = red_color;
+    field.color_adjoint_fn = red_adjoint;
+    for (int k = 0; k < 6; k++) { /* in the seeds, in the points */
+        float points[30], d_color[30], d_points[30] = {0}, code[4] = {0};
+        dist_gradients grads;
+        memset(&grads, 0, sizeof grads);
+        grads.code = code;
+        for (int i = 0; i < 30; i++) points[i] = 0.01f * (float)i, d_color[i] = 0.25f;
+        (k < 3 ? d_color : points)[13] = bad[k % 3];
+        CHECK_STATUS(DIST_OK, dist_color_backward(ctx, &field, 10, points, d_color, d_points, &grads), ctx);
+        CHECK(code[0] == 9 * 0.25f);
+        for (int i = 0; i < 30; i++) CHECK(d_points[i] == (i % 3 || i == 12 ? 0.0f : 0.25f));
+    }
+    dist_context_destroy(ctx);
+}
+
 TEST(memory_refused_to_a_texture_leaves_the_shape_as_it_was)
 {
     model m = model_make(&pairs[0].shape, 70u), t = model_make(&pairs[0].texture, 90u);
@@ -985,6 +1069,8 @@ int main(int argc, char **argv)
     RUN(color_queries_are_counted_and_none_made_where_no_color_is_asked_for);
     RUN(codes_of_a_textured_shape_are_set_one_by_one);
     RUN(color_of_a_field_that_is_older_than_its_texture_is_refused);
+    RUN(color_gradients_of_another_color_code_or_other_weights_are_refused);
+    RUN(colors_of_own_fields_lose_no_gradient_to_what_is_not_finite);
     RUN(memory_refused_to_a_texture_leaves_the_shape_as_it_was);
     RUN(a_texture_that_does_not_fit_and_gradients_that_are_not_there_are_refused);
     RUN(a_texture_net_is_created_saved_and_trained);

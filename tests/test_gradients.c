@@ -1656,6 +1656,33 @@ TEST(a_zero_upstream_gradient_costs_no_point)
     }
 }
 
+/* Where squares of coordinates are beyond floats: the others' gradients are not lost in NaN. */
+TEST(points_too_far_off_for_squares_spoil_no_analytic_gradient)
+{
+    const float c[6] = {0.1f, 0.2f, -0.1f, 0.5f, 0.2f, 0.3f}, far_off[3][3] = {{1e20f, 0.1f, 1e20f},
+                                                                             {3e38f, -3e38f, 3e38f}, {0, 1e30f, 0}};
+    dist_context *ctx = test_context();
+    for (int k = 0; k < 3; k++) {
+        dist_field field = k == 0 ? dist_field_sphere(c) : k == 1 ? dist_field_torus(c) : dist_field_box(c);
+        for (int where = 0; where < 3; where++) {
+            float points[12] = {1, 0.3f, 0.2f, 0.4f, 0.8f, 0.6f, -0.7f, 0.5f, 0.1f}, d_sdf[4] = {1, 2, 3, 1};
+            float near_by[6] = {0}, all[6] = {0}, d_points[12] = {0};
+            dist_gradients grads;
+            memcpy(points + 9, far_off[where], sizeof far_off[0]);
+            memset(&grads, 0, sizeof grads);
+            grads.code = near_by;
+            CHECK_STATUS(DIST_OK, dist_field_backward(ctx, &field, 3, points, d_sdf, NULL, NULL, NULL, &grads), ctx);
+            grads.code = all;
+            dist_status status = dist_field_backward(ctx, &field, 4, points, d_sdf, NULL, NULL, d_points, &grads);
+            CHECK_STATUS(DIST_OK, status, ctx);
+            for (int i = 0; i < 12; i++) CHECK(test_finite((double)d_points[i]));
+            for (int i = 0; i < field.code_size; i++) CHECK(fabsf(all[i] - near_by[i]) <= 1.001f);
+            CHECK(all[0] != 0);
+        }
+    }
+    dist_context_destroy(ctx);
+}
+
 TEST(a_seed_that_is_not_finite_gives_nothing_to_point_code_or_weights)
 {
     static const uint32_t wrong[3] = {0x7fc00000u, 0x7f800000u, 0xff800000u};
@@ -2355,6 +2382,7 @@ int main(int argc, char **argv)
     RUN(a_boxs_pose_is_recovered_from_12_degrees_off);
     RUN(a_lens_is_recovered_from_a_tenth_off);
     RUN(a_zero_upstream_gradient_costs_no_point);
+    RUN(points_too_far_off_for_squares_spoil_no_analytic_gradient);
     RUN(a_seed_that_is_not_finite_gives_nothing_to_point_code_or_weights);
     RUN(an_upstream_gradient_that_is_not_finite_counts_as_zero);
     RUN(an_upstream_gradient_that_overflows_is_left_out_and_counted);

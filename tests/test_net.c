@@ -1258,6 +1258,36 @@ TEST(spaces_around_the_channels_names_are_none_of_theirs)
     REFUSED(DIST_BAD_FILE, "dist.channels", "\"dist.channels\":\"sdf, ,r\"", good_tensors);
 }
 
+/* Where nothing names them the first is the distance; saved, the others have names. */
+TEST(channels_without_names_are_a_distance_and_more)
+{
+    dist_context *ctx = test_context();
+    size_t size;
+    unsigned char *bytes = file_of("", "lin0.weight 12 5;lin0.bias 12;", "F32", -1, 0.0f, &size);
+    dist_net *net = dist_net_load(ctx, bytes, size);
+    CHECK_STATUS(DIST_OK, dist_context_status(ctx), ctx);
+    size_t saved;
+    CHECK_STATUS(DIST_OK, dist_net_save(ctx, net, NULL, 0, &saved), ctx);
+    unsigned char *again = (unsigned char *)malloc(saved + 1);
+    REQUIRE(again != NULL);
+    CHECK_STATUS(DIST_OK, dist_net_save(ctx, net, again, saved, &saved), ctx);
+    again[saved] = 0;
+    for (int k = 0; k < 2; k++) {
+        dist_shape *shape = dist_shape_create(ctx, net, NULL);
+        dist_field field = dist_shape_field(shape);
+        CHECK_EQUAL(12, dist_net_channels(net));
+        CHECK(field.eval_fn != NULL && field.color_fn == NULL);
+        dist_shape_destroy(shape);
+        dist_net_destroy(net);
+        net = k ? NULL : dist_net_load(ctx, again, saved);
+    }
+    CHECK_TEXT("\"sdf,c1,c2,c3,c4,c5,c6,c7,c8,c9,c10,c11\"", (const char *)again + 8);
+    CHECK_STATUS(DIST_OK, dist_context_status(ctx), ctx);
+    free(bytes);
+    free(again);
+    dist_context_destroy(ctx);
+}
+
 /* 1e-6, the least that a bound and a scale may be, is no float: it is written as a number somewhat below. */
 TEST(the_least_numbers_a_file_may_say_are_floats)
 {
@@ -1297,6 +1327,18 @@ TEST(nothing_of_a_layer_is_left_out_without_a_word)
             "lin0.weight 4 5;lin0.bias 4;lin1.weight 1 4;lin1.bias 1;lin1.scale 4;");
     REFUSED(DIST_BAD_FILE, "layer 0 has its weights twice", "",
             "lin0.weight 4 5;lin0.bias 4;lin0.weight_g 4 1;lin0.weight_v 4 5;lin1.weight 1 4;lin1.bias 1;");
+    /* What makes another layer, but for its weight or half of it: the file would be a net of one layer less. */
+    static const char *const behind[][2] = {{"lin1.weight_v 1 1;lin1.bias 1;", "lin1.weight_v is one of a"},
+                                            {"lin1.weight_g 1 1;lin1.bias 1;", "lin1.weight_g is one of a"},
+                                            {"lin1.parametrizations.weight.original0 1 1;", "original0 is one of a"},
+                                            {"lin1.parametrizations.weight.original1 1 1;", "original1 is one of a"},
+                                            {"lin1.bias 1;", "lin1.bias is there, but no weight of layer 1"},
+                                            {"lin33.weight 1 1;", "lin33.weight is there, but no weight of layer 1"},
+                                            {"lin99999999999.bias 1;", "is there, but no weight of layer 1"}};
+    for (size_t k = 0; k < sizeof behind / sizeof behind[0]; k++) {
+        snprintf(tensors, sizeof tensors, "lin0.weight 1 5;lin0.bias 1;%s", behind[k][0]);
+        REFUSED(DIST_BAD_FILE, behind[k][1], "", tensors);
+    }
     for (int with = 0; with < 2; with++) {
         dist_context *ctx = test_context();
         snprintf(tensors, sizeof tensors, "%s%s 3 2;", layers, with ? "module.codes" : "codes");
@@ -1337,7 +1379,7 @@ TEST(layer_norm_that_only_its_tensors_tell_of_is_not_left_out)
     model_free(&m);
     const char *some = "lin0.weight 4 5;lin0.bias 4;lin1.weight 4 4;lin1.bias 4;lin2.weight 1 4;lin2.bias 1;"
                        "bn1.weight 4;bn1.bias 4;";
-    REFUSED(DIST_BAD_FILE, "norm weight of layer 0 is missing", "", some);
+    REFUSED(DIST_BAD_FILE, "norm0.weight is missing", "", some);
     REFUSED(DIST_UNSUPPORTED, "bn0.running_mean is of a batch normalization", "",
             "lin0.weight 4 5;lin0.bias 4;bn0.weight 4;bn0.bias 4;bn0.running_mean 4;lin1.weight 1 4;lin1.bias 1;");
     static const char whole[] = "lin0.weight 4 5;lin0.bias 4;norm0.weight 4;norm0.bias 4;lin1.weight 1 4;lin1.bias 1;";
@@ -1369,11 +1411,17 @@ TEST(tensors_that_do_not_fit_are_refused_with_a_sentence)
     REFUSED(DIST_BAD_FILE, "(out, in)", "", "lin0.weight 20;lin0.bias 4;");
     REFUSED(DIST_BAD_FILE, "no tensor is called lin0.weight", "", "layer.weight 4 5;");
     REFUSED(DIST_BAD_FILE, "lin", "", "lin0.weight 4 2;lin0.bias 4;lin1.weight 1 4;lin1.bias 1;");
-    REFUSED(DIST_BAD_FILE, "dist.channels", "", "lin0.weight 4 5;lin0.bias 4;lin1.weight 2 4;lin1.bias 2;");
+    REFUSED(DIST_BAD_FILE, "dist.channels names 1", "\"dist.channels\":\"sdf\"",
+            "lin0.weight 4 5;lin0.bias 4;lin1.weight 2 4;lin1.bias 2;");
+    REFUSED(DIST_BAD_FILE, "17 numbers, of at most 16", "", "lin0.weight 17 5;lin0.bias 17;");
+    REFUSED(DIST_BAD_FILE, "of 1 to 8192 by 1 to 16384", "", "lin0.weight 4 0;lin0.bias 4;");
     REFUSED(DIST_BAD_FILE, "lin0.weight_g has 3", "",
             "lin0.weight_g 3 1;lin0.weight_v 4 5;lin0.bias 4;lin1.weight 1 4;lin1.bias 1;");
-    REFUSED(DIST_BAD_FILE, "no tensor is called", "", "lin0.weight_g 4 1;lin0.bias 4;lin1.weight 1 4;lin1.bias 1;");
-    REFUSED(DIST_BAD_FILE, "norm weight", "\"dist.norm\":\"layer\"", good_tensors);
+    REFUSED(DIST_UNSUPPORTED, "lin0.weight_g must be (5, 1)", "", /* weight-norm over columns */
+            "lin0.weight_g 1 5;lin0.weight_v 5 5;lin0.bias 5;lin1.weight 1 5;lin1.bias 1;");
+    REFUSED(DIST_BAD_FILE, "lin0.weight_g is one of a", "",
+            "lin0.weight_g 4 1;lin0.bias 4;lin1.weight 1 4;lin1.bias 1;");
+    REFUSED(DIST_BAD_FILE, "norm0.weight is missing", "\"dist.norm\":\"layer\"", good_tensors);
     REFUSED(DIST_BAD_FILE, "codes must be (n, 2)", "",
             "lin0.weight 4 5;lin0.bias 4;lin1.weight 1 4;lin1.bias 1;codes 2 3;");
     REFUSED(DIST_BAD_FILE, "codes must be (n, 2)", "",
@@ -1444,6 +1492,12 @@ TEST(metadata_that_means_nothing_is_refused_with_a_sentence)
         snprintf(meta, sizeof meta, "\"%s\":\"%s\"", wrong[k][0], wrong[k][1]);
         REFUSED(DIST_BAD_FILE, wrong[k][0], meta, good_tensors);
     }
+    REFUSED(DIST_BAD_FILE, "dist.bound is \"-1\", must be a number from 1e-6 to 1000000", "\"dist.bound\":\"-1\"",
+            good_tensors);
+    REFUSED(DIST_BAD_FILE, "dist.encoding.raw is \"0.5\", must be a whole number from 0 to 1",
+            "\"dist.encoding.raw\":\"0.5\"", good_tensors);
+    REFUSED(DIST_BAD_FILE, "dist.output is \"relu\", must be tanh|none|sigmoid|tanh:2", "\"dist.output\":\"relu\"",
+            good_tensors);
     static const char *const unknown[] = {"dist.activaton", "dist.Norm", "dist.", "dist.skip_", "dist.norm.",
                                           "dist.raw", "dist.norm|norm.epsilon"};
     for (size_t k = 0; k < sizeof unknown / sizeof unknown[0]; k++) {
@@ -1871,6 +1925,7 @@ int main(int argc, char **argv)
     RUN(the_file_that_the_wrong_ones_are_made_of_is_right);
     RUN(channels_that_end_the_header_are_read_no_further);
     RUN(spaces_around_the_channels_names_are_none_of_theirs);
+    RUN(channels_without_names_are_a_distance_and_more);
     RUN(the_least_numbers_a_file_may_say_are_floats);
     RUN(nothing_of_a_layer_is_left_out_without_a_word);
     RUN(layer_norm_that_only_its_tensors_tell_of_is_not_left_out);

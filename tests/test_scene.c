@@ -1540,6 +1540,14 @@ TEST(what_is_older_than_what_it_goes_by_is_refused)
             CHECK_STATUS(on ? DIST_BAD_ARGUMENT : DIST_OK, status, ctx);
             if (on) CHECK_TEXT(folded, dist_context_message(ctx));
             dist_context_clear(ctx);
+            int index[2];
+            for (int scenes = 0; scenes < 3; scenes++) {
+                if (scenes == 0) status = dist_shape_eval(ctx, shape, 1, ones, depth);
+                else status = dist_scene_find(scenes == 1 ? scene : outer, 1, ones, index);
+                CHECK_STATUS(on ? DIST_BAD_ARGUMENT : DIST_OK, status, ctx);
+                if (on) CHECK_TEXT(folded, dist_context_message(ctx));
+                dist_context_clear(ctx);
+            }
         }
         for (int on = 1; on >= 0; on--) { /* color alone */
             CHECK_STATUS(DIST_OK, dist_net_set_weights(ctx, paint, other[1]), ctx);
@@ -1559,6 +1567,50 @@ TEST(what_is_older_than_what_it_goes_by_is_refused)
     dist_shape_destroy(shape);
     dist_net_destroy(paint);
     dist_net_destroy(net);
+    dist_context_destroy(ctx);
+}
+
+/* The numbers of an analytic field are its code: a tape and a cache of others are refused, and taken once they are back. */
+TEST(analytic_fields_whose_numbers_have_changed_are_refused)
+{
+    enum { SMALL = 8, N = SMALL * SMALL };
+    float c[6] = {0.1f, -0.1f, 0, 0.3f, 0.2f, 0.25f}, depth[N], ones[N], d_code[6] = {0}, sdf;
+    dist_context *ctx = test_context();
+    dist_camera camera = shape_camera(SMALL, SMALL);
+    dist_tape *tape = dist_tape_create(ctx, &camera, NULL);
+    dist_images out, d_out;
+    dist_gradients grads;
+    memset(&out, 0, sizeof out);
+    memset(&d_out, 0, sizeof d_out);
+    memset(&grads, 0, sizeof grads);
+    out.depth = depth;
+    d_out.depth = ones;
+    grads.code = d_code;
+    for (int i = 0; i < N; i++) ones[i] = 1;
+    for (int k = 0; k < 3; k++) {
+        dist_field field = k == 0 ? dist_field_sphere(c) : k == 1 ? dist_field_torus(c) : dist_field_box(c);
+        dist_cache *cache = dist_cache_create(ctx, &field, 16);
+        dist_field cached = dist_cache_field(cache);
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, tape), ctx);
+        for (int i = 0; i < field.code_size; i++)
+            for (int on = 1; on >= 0; on--) {
+                c[i] += on ? 0.01f : 0;
+                CHECK_STATUS(on ? DIST_BAD_ARGUMENT : DIST_OK, dist_render_backward(ctx, tape, &d_out, &grads), ctx);
+                if (on) CHECK_TEXT("are not what they were in dist_render", dist_context_message(ctx));
+                dist_context_clear(ctx);
+                CHECK_STATUS(on ? DIST_BAD_ARGUMENT : DIST_OK, dist_field_eval(ctx, &cached, 1, ones, &sdf, NULL), ctx);
+                dist_context_clear(ctx);
+                const float was[6] = {0.1f, -0.1f, 0, 0.3f, 0.2f, 0.25f};
+                memcpy(c, was, sizeof c);
+            }
+        dist_field own = field; /* what user points to is not looked at once eval_fn is another */
+        own.user = NULL;
+        own.eval_fn = poison_eval;
+        own.adjoint_fn = NULL;
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &own, &camera, NULL, &out, tape), ctx);
+        dist_cache_destroy(cache);
+    }
+    dist_tape_destroy(tape);
     dist_context_destroy(ctx);
 }
 
@@ -2154,6 +2206,7 @@ int main(int argc, char **argv)
     RUN(radii_that_floats_cannot_square_are_refused);
     RUN(scenes_refuse_what_cannot_be_placed);
     RUN(what_is_older_than_what_it_goes_by_is_refused);
+    RUN(analytic_fields_whose_numbers_have_changed_are_refused);
     RUN(what_is_not_finite_stays_so);
     RUN(what_is_not_finite_takes_nothing_from_a_placement);
     RUN(colors_are_those_of_the_instance_that_is_hit);

@@ -102,6 +102,26 @@ TEST(a_ray_looks_as_far_as_it_is_told_in_lengths_of_its_direction)
     dist_context_destroy(ctx);
 }
 
+/* Without end, in any of the words for it. */
+TEST(rays_that_look_beyond_all_floats_look_without_end)
+{
+    const float most[4] = {0, 3e38f, 3.4e38f, INFINITY};
+    float ball[4] = {0, 0, 0, 0.5f}, out[3] = {-1e6f, 0.1f, 0}, ahead[3] = {1, 0, 0};
+    dist_context *ctx = shape_context();
+    dist_field field = dist_field_sphere(ball);
+    dist_hit hit[4];
+    for (int i = 0; i < 4; i++) {
+        dist_render_desc how;
+        memset(&how, 0, sizeof how);
+        how.max_distance = most[i];
+        CHECK_STATUS(DIST_OK, dist_trace(ctx, &field, 1, out, ahead, &how, &hit[i], NULL), ctx);
+        CHECK_EQUAL(DIST_RAY_HIT, hit[i].status);
+        CHECK(hit[i].distance == hit[0].distance);
+        CHECK(dist_render_desc_resolve(&how).max_distance == 0.0f);
+    }
+    dist_context_destroy(ctx);
+}
+
 /* However short it looks: a ray that begins in the solid says so. */
 TEST(a_ray_that_looks_nowhere_knows_where_it_is)
 {
@@ -1334,6 +1354,7 @@ int main(int argc, char **argv)
     test_begin(argc, argv);
     RUN(any_hit_finds_a_blocker_where_there_is_one_for_fewer_queries);
     RUN(a_ray_looks_as_far_as_it_is_told_in_lengths_of_its_direction);
+    RUN(rays_that_look_beyond_all_floats_look_without_end);
     RUN(a_ray_that_looks_nowhere_knows_where_it_is);
     RUN(any_hit_and_max_distance_are_refused_where_they_mean_nothing);
     RUN(closest_points_of_distances_are_exact);

@@ -1492,6 +1492,36 @@ TEST(many_free_rays_are_the_same_as_single_ones)
     dist_context_destroy(ctx);
 }
 
+/* A clamp says nothing of the surface: however small, as many rays hit, within half of it. */
+TEST(clamps_below_the_default_epsilon_hide_no_surface)
+{
+    enum { SMALL = 24, N = SMALL * SMALL };
+    dist_context *ctx = shape_context();
+    dist_camera camera = shape_camera(SMALL, SMALL);
+    unsigned long long hits = 0;
+    static float depth[2][N];
+    for (int k = 0; k < 5; k++) {
+        const double clamps[5] = {0, 1e-3, 8e-5, 2e-5, 4e-6};
+        test_shape shape = shape_make(SHAPE_SPHERE, 0.5, 0, 0, 0);
+        shape.clamp = clamps[k];
+        dist_field field = shape_field(&shape, 1, 1);
+        dist_render_desc how = plain_how();
+        dist_images out;
+        dist_stats stats;
+        memset(&out, 0, sizeof out);
+        out.depth = depth[k > 0];
+        out.stats = &stats;
+        field.clamp = (float)clamps[k];
+        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, NULL), ctx);
+        if (k == 0) hits = stats.hits;
+        CHECK_EQUAL(hits, stats.hits);
+        if (k) CHECK(stats.epsilon <= 0.5f * field.clamp);
+        for (int i = 0; i < N; i++) CHECK(fabsf(depth[k > 0][i] - depth[0][i]) < 1e-3f);
+    }
+    CHECK(hits > 50);
+    dist_context_destroy(ctx);
+}
+
 TEST(trace_refuses_what_it_cannot_trace)
 {
     dist_context *ctx = shape_context();
@@ -2358,6 +2388,7 @@ int main(int argc, char **argv)
     RUN(free_rays_take_directions_of_any_length);
     RUN(free_rays_without_a_direction_are_not_finite);
     RUN(many_free_rays_are_the_same_as_single_ones);
+    RUN(clamps_below_the_default_epsilon_hide_no_surface);
     RUN(trace_refuses_what_it_cannot_trace);
     RUN(each_row_of_the_ladder_asks_less_than_the_one_before);
     RUN(the_paper_converges_up_to_slope_1_2_and_not_from_1_34_on);

@@ -1570,7 +1570,7 @@ TEST(what_is_older_than_what_it_goes_by_is_refused)
     dist_context_destroy(ctx);
 }
 
-/* The numbers of an analytic field are its code: a tape and a cache of others are refused, and taken once they are back. */
+/* The numbers of an analytic field are its code: a tape and a cache of others are refused, until they are back. */
 TEST(analytic_fields_whose_numbers_have_changed_are_refused)
 {
     enum { SMALL = 8, N = SMALL * SMALL };

@@ -956,8 +956,8 @@ typedef struct dist_workspace_desc {
    each rounded up to one, and takes nothing back: exactly; with one less some create function fails with
    DIST_OUT_OF_MEMORY. The create functions' own code is run without memory. dist_net_load_file needs its file's bytes
    besides, meshes and Chamfer distance theirs.
-   0: a create function would refuse (but for what only tensors' numbers, types and biases tell, which are not looked
-   at); desc->context->logger is told why. The table of contents of a model is read into memory of
+   0: a create function would refuse (but for what only tensors' numbers and types and those of biases, norms and
+   weight_g tell, which are not looked at); desc->context->logger is told why. The table of contents of a model is read into memory of
    desc->context->allocator, or malloc's, and given back: that allocator is not the arena that is still to be made. */
 DIST_API size_t dist_workspace_bytes(const dist_workspace_desc *desc);
 
@@ -9586,7 +9586,7 @@ static dist_status disti_loader_values(disti_loader *loader)
         size_t out = (size_t)layer->out, in = (size_t)layer->in;
         float *w = net->params + layer->weight, *bias = net->params + layer->bias;
         disti_loader_read(loader, weight, "lin", l, ".weight", out * in, w);
-        if (gain && gain->count == out && gain->shape[0] != out)
+        if (gain && gain->count == out && gain->rank > 0 && gain->shape[0] != out)
             return disti_loader_fail(loader, DIST_UNSUPPORTED, "dist_net_load: tensor %s must be (%d, 1): weight-norm "
                                      "of dimension 0", gain->name, (double)out, 0);
         if (gain && disti_loader_read(loader, gain, "lin", l, ".weight_g", out, bias) == DIST_OK)

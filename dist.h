@@ -957,8 +957,9 @@ typedef struct dist_workspace_desc {
    DIST_OUT_OF_MEMORY. The create functions' own code is run without memory. dist_net_load_file needs its file's bytes
    besides, meshes and Chamfer distance theirs.
    0: a create function would refuse (but for what only tensors' numbers and types and those of biases, norms and
-   weight_g tell, which are not looked at); desc->context->logger is told why. The table of contents of a model is read into memory of
-   desc->context->allocator, or malloc's, and given back: that allocator is not the arena that is still to be made. */
+   weight_g tell, which are not looked at); desc->context->logger is told why. The table of contents of a model is read
+   into memory of desc->context->allocator, or malloc's, and given back: that allocator is not the arena that is still
+   to be made. */
 DIST_API size_t dist_workspace_bytes(const dist_workspace_desc *desc);
 
 #ifdef __cplusplus

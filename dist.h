@@ -464,7 +464,9 @@ typedef struct dist_net_desc {
     int color;        /* 1: a texture: r, g, b in place of the distance, with a sigmoid at the end unless linear */
     int geometric;    /* 1: starts near the distance to a sphere of half the bound, where f is 0 in the mean; ReLU and
                          softplus only, of that best where scale * bound is some 30 or more (f grows slower than the
-                         distance then: by half of it at 100). Fourier levels have no share in it. 0: PyTorch's start */
+                         distance then: by half of it at 100). Fourier levels have no share in it, nor has the code: of
+                         a code of zeros its gradient and that of its weights are 0, so begin with random ones.
+                         0: PyTorch's start */
     float bound;      /* radius of the sphere that holds the shape, 1e-6 to 1e6; 0: 1 */
     float clamp;      /* 0: 0.1 with a code, none without one or of a texture; below 0: none */
     unsigned seed;
@@ -536,9 +538,11 @@ DIST_API void dist_camera_ray(const dist_camera *camera, float x, float y, float
 
 enum { DIST_TRACE_GUARDED = 0, DIST_TRACE_PAPER = 1 };
 enum { DIST_PAPER_COARSE_TO_FINE = 0, DIST_PAPER_AGGRESSIVE, DIST_PAPER_DYNAMIC, DIST_PAPER_PARALLEL };
-/* Of depth: IMPLICIT: -df / (grad f . v), exact at the hit. NORMAL: that times |n . v|, so that grazing pixels do not
-   dominate. PAPER: alpha times the sum of df over the K = how.samples samples of smallest |f|, but for those beyond .1
-   of the bounding radius; with the guarded tracer all K are the hit, so that it grows with K. */
+/* Of depth: IMPLICIT: -df / (grad f . v), exact at the hit. NORMAL: that, with the lens's own share, times |n . v|, so
+   that grazing pixels do not dominate. PAPER: alpha times the sum of df over the K = how.samples samples of smallest
+   |f|, but for those beyond .1 of the bounding radius; with the guarded tracer all K are the hit, so that it grows with
+   K. As the hit moves so does the color that is seen, with the same weights; normals move exactly, but with PAPER not
+   at all. */
 enum { DIST_GRADIENT_AUTO = 0, DIST_GRADIENT_IMPLICIT, DIST_GRADIENT_NORMAL, DIST_GRADIENT_PAPER };
 enum { DIST_NORMAL_ANALYTIC = 0, DIST_NORMAL_DIFFERENCE = 1 };
 enum { DIST_SPACE_CAMERA = 0, DIST_SPACE_WORLD = 1 };
@@ -562,7 +566,8 @@ enum {
 typedef struct dist_render_desc {
     int max_steps; /* queries per ray at most, to 60000, and up to 40 more to where f has crossed 0 between two of them;
                       0: 300 guarded, 10000 certified, 50 paper */
-    float step_scale;    /* alpha, above 0, to 100; 0: 1.5 (paper: rows aggressive and coarse-to-fine) */
+    float step_scale;    /* alpha, above 0, to 100; 0: 1.5 (paper: rows aggressive and coarse-to-fine; of the others 1
+                            whatever it is) */
     float epsilon; /* largest |f| of a hit, shape units, which those interpolated between hits alike may exceed; 0: 5e-5
                       of the bounding radius or field.detail, or less where a pixel is smaller (paper: 5e-5). The
                       guarded tracer takes at most half of field.clamp */
@@ -602,7 +607,8 @@ typedef struct dist_render_desc {
                             pixels in the bounding sphere's rectangle (dist_trace: over groups of 1024 rays), so the
                             bits do not depend on threads; a tile spends its share on cones first, then on every 8th
                             pixel, 4th and so on, and keeps what its hits' normals and colors cost. Rays that it does
-                            not finish are UNRESOLVED */
+                            not finish are UNRESOLVED, and what it does not use is not another's: a picture may need
+                            twice the queries that it takes without a limit */
 } dist_render_desc;
 
 /* What will be used: every 0 replaced by its default; the guarded tracer's epsilon, normal_delta and lipschitz, which
@@ -871,7 +877,8 @@ typedef struct dist_mesh {
 } dist_mesh;
 
 typedef struct dist_mesh_desc {
-    int resolution; /* cells along each side of the cube around the bounding sphere, 2 to 2048; 0: 128 */
+    int resolution; /* cells along each side of the cube around the bounding sphere, 2 to 2048 and no smaller than four
+                       floats are apart there; 0: 128 */
     float level;    /* the isosurface f = level */
     int no_skip;    /* 1: evaluate every cell, also those that the Lipschitz figure rules out */
     int normals;    /* 1: also normals, one gradient query a vertex */
@@ -14195,6 +14202,31 @@ static void disti_paper_finish(const disti_tracer *tracer, disti_ray *ray)
     ray->best = DISTI_MAX(ray->best, (float)-ray->base);
 }
 
+/* Rays that are INSIDE have f where they start, which is their first sample but for coarse-to-fine's, and of the tape's
+   samples that alone: those of the march lie at the way out. */
+static void disti_paper_inside(const disti_tracer *tracer, int worker, const disti_bench *bench,
+                               const disti_paper_level *level)
+{
+    size_t count = 0, queries;
+    for (size_t i = 0; i < level->n; i++) {
+        if (bench->rays[i].mode != DISTI_DONE || bench->rays[i].status != DIST_RAY_INSIDE) continue;
+        disti_ray_point(&bench->rays[i], bench->rays[i].enter, bench->points + 3 * count);
+        bench->index[count++] = (int)i;
+    }
+    int asks = tracer->how.paper_row == DIST_PAPER_COARSE_TO_FINE;
+    queries = asks && count > 0 ? disti_query(tracer, worker, bench, count) : 0;
+    bench->stats->march_queries += queries;
+    for (size_t k = 0; k < count; k++) {
+        disti_ray *ray = &bench->rays[bench->index[k]];
+        float f = k < queries ? bench->sdf[k] : ray->a.f;
+        disti_ray_end(ray, DIST_RAY_INSIDE, ray->enter, f, 0.0f);
+        if (!level->samples) continue;
+        float *samples = disti_paper_samples(tracer, level, (size_t)bench->index[k]);
+        for (int j = 0; j < tracer->how.samples; j++) samples[4 * j] = j == 0 ? f : 3e38f;
+        memcpy(samples + 1, bench->points + 3 * k, 3 * sizeof(float));
+    }
+}
+
 /* Traces one tile. samples (rays, how.samples, 4) may be NULL; it is written for every ray. */
 static void disti_paper_trace(const disti_tracer *tracer, int worker, const disti_tile *tile, const disti_bench *bench,
                               float *samples, size_t samples_stride)
@@ -14223,6 +14255,7 @@ static void disti_paper_trace(const disti_tracer *tracer, int worker, const dist
     }
     for (size_t i = 0; i < n; i++)
         if (bench->rays[i].mode != DISTI_DONE) disti_paper_finish(tracer, &bench->rays[i]);
+    disti_paper_inside(tracer, worker, bench, &level);
     disti_trace_end(tracer, bench, n);
 }
 #endif
@@ -17373,8 +17406,9 @@ static void disti_extract_polish(disti_extract *x, size_t n, int steps, float *v
             double move = length > 0.0 ? (double)best[i] / length : 0.0;
             move = (double)scale[i] * DISTI_MAX(DISTI_MIN(move, longest), -longest);
             for (size_t k = 0; k < 3; k++) {
-                double unit = length > 0.0 ? (double)s[k] / length : 0.0;
-                p[k] = (float)((double)v[k] - move * unit);
+                double unit = length > 0.0 ? (double)s[k] / length : 0.0, side = (double)x->field->radius;
+                double to = (double)v[k] - move * unit, from = (double)x->field->center[k];
+                p[k] = (float)DISTI_MIN(DISTI_MAX(to, from - side), from + side);
                 if (normals && step == steps) normals[3 * i + k] = (float)unit;
             }
         }
@@ -17413,11 +17447,19 @@ static void disti_extract_blocks(disti_extract *x)
 static dist_status disti_extract_check(dist_context *ctx, const dist_field *field, const dist_mesh_desc *desc)
 {
     const char *name = "dist_mesh_extract";
+    dist_mesh_desc d = dist_mesh_desc_resolve(desc);
     dist_status status = disti_field_check(ctx, field, name);
-    if (status != DIST_OK || !desc) return status;
-    if (desc->resolution != 0 && (desc->resolution < 2 || desc->resolution > 2048))
+    if (status != DIST_OK) return status;
+    if (desc && desc->resolution != 0 && (desc->resolution < 2 || desc->resolution > 2048))
         return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: resolution is %d, must be 2 to 2048, or 0", name,
                           desc->resolution, 0);
+    float farthest = 0.0f;
+    for (int k = 0; k < 3; k++) farthest = DISTI_MAX(farthest, fabsf(field->center[k]) + field->radius);
+    if (2.0f * field->radius < 5e-7f * farthest * (float)d.resolution)
+        return disti_fail(ctx, DIST_BAD_ARGUMENT, "%s: resolution is %d, must be at most %d, where cells are as small "
+                                                  "as floats are apart so far from 0", name, d.resolution,
+                          floor(2.0 * (double)field->radius / (5e-7 * (double)farthest)));
+    if (!desc) return DIST_OK;
     if (!disti_finite(desc->level))
         return disti_fail(ctx, DIST_NOT_FINITE, "%s: level is %d, must be finite", name, (double)desc->level, 0);
     const disti_limit limits[] = {{"no_skip", (double)desc->no_skip, 0, 1}, {"normals", (double)desc->normals, 0, 1},
@@ -18358,14 +18400,20 @@ static dist_mesh *disti_mesh_parse(dist_context *ctx, const char *label, const v
     if (size > 4 && memcmp(text, "ply", 3) == 0 && disti_is_space(text[3])) {
         good = disti_read_ply(&r);
     } else {
-        size_t prefix = size > 4 && text[0] == 'C' ? 1 : 0; /* C: colors, N: normals behind the coordinates */
+        disti_text peek = r.text;
+        for (disti_skip_space(&peek); peek.at < peek.end && *peek.at == '#'; disti_skip_space(&peek))
+            disti_skip_line(&peek);
+        text = peek.at;
+        size = (size_t)(peek.end - text);
+        size_t prefix = size > 4 && text[0] == 'S' && text[1] == 'T' ? 2 : 0; /* of textures; C: colors, N: normals */
+        prefix += size > 4 + prefix && text[prefix] == 'C';
         prefix += size > 4 + prefix && text[prefix] == 'N';
         int off = size > 3 + prefix && memcmp(text + prefix, "OFF", 3) == 0;
         if (off) { /* ModelNet's files may have the first count at the word: OFF490 518 0 */
             char next = text[prefix + 3];
             off = disti_is_space(next) || (next >= '0' && next <= '9');
         }
-        if (off) r.text.at += prefix + 3;
+        if (off) r.text.at = text + prefix + 3;
         obj = !off;
         size_t at = 0;
         while (at < size && disti_is_space(text[at])) at++;

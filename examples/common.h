@@ -1208,6 +1208,9 @@ static inline const char *write_picture(const char *stem, int width, int height,
 {
     static char path[PATH_SIZE];
 #ifdef COMMON_STB
+    if ((3.0 * width + 1.0) * height > 2147483647.0) { /* stb_image_write counts in int */
+        fail("%s.png would have %d by %d pixels, more than 2 GB", stem, width, height);
+    }
     FILE *file = open_file(path_of(path, stem, ".png"), "wb");
     if (!stbi_write_png_to_func(write_bytes, file, width, height, 3, rgb, 3 * width)) {
         fail("out of memory while %s is written", path);

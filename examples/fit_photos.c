@@ -783,6 +783,8 @@ static request read_options(int argc, char **argv)
     if (r.weights[0] < 0 || r.weights[1] < 0) { fail("--weights must not be negative"); }
     option_belongs(r.photos && (taken || r.width), "--views, --size, --fov and --background",
                    "are of photos that are taken, not of --photos");
+    option_belongs(r.photos && (r.texture || r.color_code), "--texture and --color-code",
+                   "are of photos that are taken, not of --photos");
     option_belongs(r.off[0] < 100.0f && !r.similarity, "--off", "is where --similarity starts, which is not given");
     option_belongs(r.cells && r.gradient != GRADIENT_MESH, "--mesh-cells", "belongs to --gradient mesh");
     if (r.off[0] >= 100.0f) { r.off[0] = r.off[1] = 10.0f, r.off[2] = 0.1f; }

@@ -161,6 +161,10 @@ static job read_options(int argc, char **argv)
         fail("--zoom-at %g,%g lies outside the picture", (double)j.zoom_at[0], (double)j.zoom_at[1]);
     }
     if (j.relit && j.frames) { fail("--relight is of one picture, and --turntable asks for %d", j.frames); }
+    if (3.0 * j.view.width * j.view.height * j.frames > 2e9) {
+        fail("--turntable %d frames of %d by %d pixels make a sheet of more than 2 GB", j.frames, j.view.width,
+             j.view.height);
+    }
     if (j.report && j.frames) { fail("--report is of one picture, and --turntable asks for %d", j.frames); }
     if (j.zoom > j.view.width || j.zoom > j.view.height) { fail("--zoom %d leaves no pixel of the picture", j.zoom); }
     if (j.view.width * j.samples > 16384 || j.view.height * j.samples > 16384) {

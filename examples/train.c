@@ -670,8 +670,9 @@ static void evaluate_family(dist_context *ctx, const settings *how, const dist_n
     }
     qsort(all, (size_t)found, sizeof *all, ascending);
     double median = found ? 0.5 * (all[found / 2] + all[(found - 1) / 2]) : 0.0;
-    printf("%s,%s,%d,%d,%.3f,%.3f,%.3f,%.3f\n", shape_family_name(family), held_out ? "held-out" : "training", count,
-           count - found, found ? sum / found : 0.0, median, found ? all[found - 1] : 0.0, floor_sum);
+    printf("%s,%s,%d,%d,", shape_family_name(family), held_out ? "held-out" : "training", count, count - found);
+    if (found) { printf("%.3f,%.3f,%.3f,%.3f\n", sum / found, median, all[found - 1], floor_sum); }
+    if (!found) { printf(",,,%.3f\n", floor_sum); } /* no surface was found, which is no distance of 0 */
     free(all);
     free(code);
 }

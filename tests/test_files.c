@@ -288,6 +288,8 @@ static const char *const good_files[] = {
     "OFF\n4 1 4\n0 0 0\n1 0 0\n\n# comment\n1 1 0 # more\n0 1 0\n4 0 1 2 3 255 0 0\n",
     "OFF 4 2 0\r\n0 0 0\r\n1 0 0\r\n1 1 0\r\n0 1 0\r\n3 0 1 2\r\n3 0 2 3\r\n",
     "OFF4 2 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2\n3 0 2 3\n",
+    "\n# by hand\n\n# twice\nOFF\n4 2\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2\n3 0 2 3\n",
+    "STOFF 4 2 0\n0 0 0 .5 .5\n1 0 0 1 .5\n1 1 0 1 1\n0 1 0 .5 1\n3 0 1 2\n3 0 2 3\n",
     "OFF\n4 # vertices\n2\n5 # edges\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2\n3 0 2 3\n",
     "OFF\n4 2\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n3 0 1 2\n3 0 2 3\n",
     "COFF\n4 1 0\n0 0 0 1 1 1 1\n1 0 0 1 1 1 1\n1 1 0 1 1 1 1\n0 1 0 1 1 1 1\n4 0 1 2 3\n",

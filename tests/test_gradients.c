@@ -1108,40 +1108,54 @@ TEST(silhouette_backward_off_the_sphere_moves_only_the_camera)
 
 /* A wide lens that looks past the sphere: of most rays the camera itself is the point nearest to it. */
 /* Neither a hit nor off the sphere: the ray starts in the solid, so S = -f - epsilon where f is nearest to 0. */
+/* |f| where they start, or f where they are hits, whatever the march found after that: all of the paper's rows, too. */
 TEST(silhouette_backward_of_rays_that_start_inside_matches_differences)
 {
     enum { SIDE = 5, ALL = SIDE * SIDE };
     const float eye[3] = {0.1f, 0.05f, -0.2f}, at[3] = {0, 0, 1}, up[3] = {0, 1, 0};
-    float silhouette[ALL], ones[ALL], ball[4] = {0, 0, 0, 0}, d_ball[4] = {0, 0, 0, 0};
-    unsigned char status[ALL];
-    double sum[2] = {0, 0}, h = 2e-3;
-    dist_images out, d_out;
-    dist_gradients grads;
+    const float start[4] = {0.05f, -0.1f, 0.1f, 0.8f};
     dist_context *ctx = test_context();
     dist_camera camera = dist_camera_look_at(SIDE, SIDE, 0.7f, eye, at, up);
-    dist_tape *tape = dist_tape_create(ctx, &camera, NULL);
-    memset(&out, 0, sizeof out);
-    memset(&d_out, 0, sizeof d_out);
-    memset(&grads, 0, sizeof grads);
-    out.silhouette = silhouette;
-    out.status = status;
-    d_out.silhouette = ones;
-    grads.code = d_ball;
-    for (int k = 0; k < 3; k++) { /* the last one is what the tape keeps */
-        ball[3] = 0.8f + (float)(k == 0 ? -h : k == 1 ? h : 0);
-        dist_field field = dist_field_sphere(ball);
-        field.radius = 1.0f;
-        CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, NULL, &out, tape), ctx);
-        for (int i = 0; i < ALL; i++) {
-            ones[i] = 1.0f;
-            CHECK_EQUAL(DIST_RAY_INSIDE, status[i]);
-            if (k < 2) { sum[k] += (double)silhouette[i]; }
+    for (int k = 0; k < 10; k++) { /* by the guarded tracer, then by each row of the paper's; no hits, and hits */
+        float silhouette[ALL], ones[ALL], ball[4], d_ball[4] = {0, 0, 0, 0};
+        unsigned char status[ALL];
+        double sum[9];
+        const double h = 2e-3;
+        dist_render_desc how;
+        memset(&how, 0, sizeof how);
+        how.trace = k > 1 ? DIST_TRACE_PAPER : DIST_TRACE_GUARDED;
+        how.paper_row = k > 1 ? k / 2 - 1 : 0;
+        how.inside = k % 2 ? DIST_INSIDE_HIT : DIST_INSIDE_BACKGROUND;
+        dist_tape *tape = dist_tape_create(ctx, &camera, &how);
+        dist_images out, d_out;
+        dist_gradients grads;
+        memset(&out, 0, sizeof out);
+        memset(&d_out, 0, sizeof d_out);
+        memset(&grads, 0, sizeof grads);
+        out.silhouette = silhouette;
+        out.status = status;
+        d_out.silhouette = ones;
+        grads.code = d_ball;
+        for (int side = 0; side < 9; side++) { /* the last one is what the tape keeps */
+            memcpy(ball, start, sizeof ball);
+            if (side < 8) ball[side / 2] += (float)(side % 2 ? h : -h);
+            dist_field field = dist_field_sphere(ball);
+            field.radius = 1.0f;
+            CHECK_STATUS(DIST_OK, dist_render(ctx, &field, &camera, &how, &out, tape), ctx);
+            sum[side] = 0;
+            for (int i = 0; i < ALL; i++) {
+                ones[i] = 1.0f;
+                CHECK_EQUAL(DIST_RAY_INSIDE, status[i]);
+                sum[side] += (double)silhouette[i];
+            }
         }
+        double f = sqrt(0.05 * 0.05 + 0.15 * 0.15 + 0.3 * 0.3) - 0.8;
+        CHECK_NEAR((k % 2 ? f : -f) * ALL, sum[8], 1e-4 * ALL);
+        CHECK_STATUS(DIST_OK, dist_render_backward(ctx, tape, &d_out, &grads), ctx);
+        for (int i = 0; i < 4; i++) CHECK_NEAR((sum[2 * i + 1] - sum[2 * i]) / (2 * h), (double)d_ball[i], 0.01 * ALL);
+        CHECK_NEAR(k % 2 ? -ALL : ALL, (double)d_ball[3], 0.01 * ALL);
+        dist_tape_destroy(tape);
     }
-    CHECK_STATUS(DIST_OK, dist_render_backward(ctx, tape, &d_out, &grads), ctx);
-    CHECK_NEAR((sum[1] - sum[0]) / (2 * h), (double)d_ball[3], 0.01 * ALL);
-    CHECK_NEAR(ALL, (double)d_ball[3], 0.01 * ALL); /* |f| there is the radius less the eye's distance */
-    dist_tape_destroy(tape);
     dist_context_destroy(ctx);
 }
 

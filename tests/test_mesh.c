@@ -307,6 +307,59 @@ TEST(refined_vertices_lie_on_the_surface_and_normals_are_analytic)
     dist_context_destroy(ctx);
 }
 
+/* Steps along a gradient that points out of the cube end at its side. */
+TEST(refined_vertices_stay_in_the_cube)
+{
+    float ball[4] = {0.3f, 0.2f, -0.1f, 0.5f};
+    dist_context *ctx = test_context();
+    dist_mesh_desc desc;
+    memset(&desc, 0, sizeof desc);
+    desc.resolution = 13;
+    desc.refine = 4;
+    dist_field field = dist_field_sphere(ball);
+    field.center[0] = 0;
+    field.radius = 0.6f; /* cuts the ball off */
+    dist_mesh *mesh = dist_mesh_extract(ctx, &field, &desc);
+    REQUIRE(mesh != NULL && mesh->vertex_count > 100);
+    for (size_t i = 0; i < 3 * mesh->vertex_count; i++)
+        CHECK(fabsf(mesh->vertices[i] - field.center[i % 3]) <= 0.6f * (1 + 1e-6f));
+    dist_mesh_destroy(mesh);
+    dist_context_destroy(ctx);
+}
+
+TEST(cells_finer_than_floats_are_refused)
+{
+    dist_context *ctx = test_context();
+    for (int k = 0; k < 4; k++) {
+        float ball[4] = {k < 2 ? 1e6f : -1e4f, 0, 0, 1};
+        dist_mesh_desc desc;
+        memset(&desc, 0, sizeof desc);
+        desc.resolution = k == 1 ? 4 : k == 3 ? 2048 : 0;
+        dist_field field = dist_field_sphere(ball);
+        dist_mesh *mesh = dist_mesh_extract(ctx, &field, &desc);
+        CHECK((mesh != NULL) == (k == 1 || k == 2));
+        if (k == 0) CHECK_TEXT("resolution is 128, must be at most 4, where cells", dist_context_message(ctx));
+        dist_context_clear(ctx);
+        double area = 0;
+        for (size_t t = 0; mesh && t < mesh->triangle_count; t++) {
+            double e[2][3], square = 0;
+            for (int i = 0; i < 6; i++) {
+                const unsigned *corner = mesh->triangles + 3 * t;
+                const float *v = mesh->vertices + 3 * (size_t)corner[1 + i / 3];
+                e[i / 3][i % 3] = (double)v[i % 3] - (double)mesh->vertices[3 * (size_t)corner[0] + (size_t)(i % 3)];
+            }
+            for (int i = 0; i < 3; i++) {
+                double c = e[0][(i + 1) % 3] * e[1][(i + 2) % 3] - e[0][(i + 2) % 3] * e[1][(i + 1) % 3];
+                square += c * c;
+            }
+            area += 0.5 * sqrt(square);
+        }
+        if (mesh) CHECK_NEAR(12.566, area, k == 1 ? 5 : 0.1);
+        dist_mesh_destroy(mesh);
+    }
+    dist_context_destroy(ctx);
+}
+
 TEST(an_empty_surface_is_a_mesh_of_nothing)
 {
     dist_context *ctx = test_context();
@@ -914,6 +967,8 @@ int main(int argc, char **argv)
     RUN(skipping_changes_no_bit_and_saves_most_queries);
     RUN(a_net_is_closed_at_a_fine_resolution);
     RUN(refined_vertices_lie_on_the_surface_and_normals_are_analytic);
+    RUN(refined_vertices_stay_in_the_cube);
+    RUN(cells_finer_than_floats_are_refused);
     RUN(an_empty_surface_is_a_mesh_of_nothing);
     RUN(bad_descs_and_fields_are_refused);
     RUN(a_field_that_is_not_finite_is_refused);

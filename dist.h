@@ -4096,12 +4096,18 @@ static float disti_length(float x, float y, float z)
     return sqrtf(x * x + y * y + z * z);
 }
 
+/* 0 of 0, and where q is so far off that squares are not finite, as -ffast-math's root of them is not, either. */
+static float disti_inverse(float length)
+{
+    return disti_finite(length) && length > 0.0f ? 1.0f / length : 0.0f;
+}
+
 /* sphere    f = |q| - r          df/dp = q / |q|    df/dcenter = -df/dp    df/dr = -1 */
 static void disti_sphere_point(const float *c, const float *p, float *f, float *g, float *d_c)
 {
     float q[3] = {p[0] - c[0], p[1] - c[1], p[2] - c[2]};
     float length = disti_length(q[0], q[1], q[2]);
-    float inverse = length > 0.0f ? 1.0f / length : 0.0f;
+    float inverse = disti_inverse(length);
     *f = length - c[3];
     for (int i = 0; i < 3; i++) {
         g[i] = q[i] * inverse;
@@ -4118,10 +4124,10 @@ static void disti_torus_point(const float *c, const float *p, float *f, float *g
     float ring = sqrtf(q[0] * q[0] + q[2] * q[2]);
     float h = ring - c[3];
     float length = sqrtf(h * h + q[1] * q[1]);
-    float inverse = length > 0.0f ? 1.0f / length : 0.0f;
-    float inverse_ring = ring > 0.0f ? 1.0f / ring : 0.0f;
+    float inverse = disti_inverse(length);
+    float inverse_ring = disti_inverse(ring);
     *f = length - c[4];
-    if (!disti_finite(length)) h = 0.0f; /* so far off that squares are not */
+    if (inverse == 0.0f) h = 0.0f;
     g[0] = h * inverse * q[0] * inverse_ring;
     g[1] = q[1] * inverse;
     g[2] = h * inverse * q[2] * inverse_ring;
@@ -4145,7 +4151,7 @@ static void disti_box_point(const float *c, const float *p, float *f, float *g, 
     float x = DISTI_MAX(a[0], 0.0f), y = DISTI_MAX(a[1], 0.0f), z = DISTI_MAX(a[2], 0.0f);
     float outside = disti_length(x, y, z);
     *f = outside + DISTI_MIN(a[largest], 0.0f);
-    if (outside > 0.0f) {
+    if (outside > 0.0f && disti_finite(outside)) {
         d_a[0] = x / outside;
         d_a[1] = y / outside;
         d_a[2] = z / outside;

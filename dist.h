@@ -607,8 +607,8 @@ typedef struct dist_render_desc {
                             pixels in the bounding sphere's rectangle (dist_trace: over groups of 1024 rays), so the
                             bits do not depend on threads; a tile spends its share on cones first, then on every 8th
                             pixel, 4th and so on, and keeps what its hits' normals and colors cost. Rays that it does
-                            not finish are UNRESOLVED, and what it does not use is not another's: a picture may need
-                            twice the queries that it takes without a limit */
+                            not finish are UNRESOLVED, and what it does not use is not another's: a picture needs
+                            more room than the queries that it takes without a limit */
 } dist_render_desc;
 
 /* What will be used: every 0 replaced by its default; the guarded tracer's epsilon, normal_delta and lipschitz, which

@@ -14,7 +14,7 @@
    of several threads: their rate over that of one thread, and peak_speedup the same of the peak loop, which says what
    the machine gives; one thread and all of them take turns, by the clock, the fastest of each, since what else runs
    costs several threads more than one; 0 in other rows. Of the narrow nets 12288 points are asked for at a time, so
-   that a pass is long beside the 7 microseconds that it takes to begin with two threads and end. */
+   that a pass is long beside what it takes to begin with several threads and end. */
 #define DIST_IMPLEMENTATION
 #include "../dist.h"
 #include "../examples/common.h"

@@ -86,7 +86,7 @@ build/%: bench/%.c $(LIBRARY) $(HEADERS) | build/stb/done
 $(TEST_DIR)/test_%: tests/test_%.c $(TEST_DIR)/inside.o $(wildcard tests/*.h examples/*.h bench/*.h)
 	$(CC) $(CFLAGS) $(TEST_FLAGS) $< $(TEST_DIR)/inside.o -o $@ -lm
 
-INSIDE = $(addprefix $(TEST_DIR)/test_,archive half kernels needs parts)
+INSIDE = $(addprefix $(TEST_DIR)/test_,inside needs)
 $(INSIDE): $(TEST_DIR)/test_%: tests/test_%.c dist.h $(wildcard tests/*.h)
 	@mkdir -p $(TEST_DIR)
 	$(CC) $(CFLAGS) $(TEST_FLAGS) $< -o $@ -lm

@@ -54,7 +54,9 @@ row() {
             ${targets:+TESTS="$targets"} test-programs || true
     fi
     data=${DIST_DATA:-../shared/data}
-    [ -z "$emulator" ] || data=build/none # full-size networks take an emulator too long: those tests skip
+    case $compiler$emulator in # full-size networks take an emulator, or what does not optimize, too long: those tests skip
+    tcc | *qemu* | *node* | *wine*) data=build/none ;;
+    esac
     DIST_DATA=$data DIST_TEST_ISA=$isa DIST_TEST_QUICK=$fast sh tests/run.sh -d "$folder" -e "$emulator" $tests >build/matrix/row.log 2>&1
     sed '$d' build/matrix/row.log
     sum=$(sed -n '$s/^\([0-9]*\) passed, \([0-9]*\) failed\(, \([0-9]*\) skipped\)*$/\1 \2 \4/p' build/matrix/row.log)
@@ -101,9 +103,9 @@ if [ -n "$quick" ]; then
         skip_row sanitizers "$cc has no sanitizers here"
     fi
     # What does not optimize is slow: there the parts that depend on the compiler, inline functions and scratch.
-    row O0 build/matrix/O0 $cc "-O0" "" 1 "" test_kernels test_half test_net test_context test_render test_workspace
+    row O0 build/matrix/O0 $cc "-O0" "" 1 "" test_inside test_net test_context test_render test_workspace
     # What depends on the instruction set, and on the order of sums.
-    set -- test_kernels test_half test_net test_color test_second test_weights test_render test_stability
+    set -- test_inside test_net test_color test_second test_weights test_render test_stability
     row fast_math build/matrix/fast_math $cc "-O2 -ffast-math" "" 1 "" "$@" test_trace test_gradients test_scene \
         test_camera
     isa_row scalar build $cc "-O2" scalar 1 "$@" # test_trace takes minutes there
@@ -113,7 +115,7 @@ if [ -n "$quick" ]; then
         skip_row avx2 "make test has run with it if this processor has it"
     fi
     # Inline assembly in the other dialect.
-    isa_row masm build/matrix/masm $cc "-O2 -masm=intel" "" 1 test_kernels test_half
+    isa_row masm build/matrix/masm $cc "-O2 -masm=intel" "" 1 test_inside
     # As most programs are built, with multiply-adds where the compiler sees them: the same ones for few points and many.
     isa_row native_scalar build/matrix/native $cc "-O3 -march=native -ffp-contract=fast" scalar 1 test_net
 else
@@ -135,7 +137,7 @@ else
         row "${cc}_O3" "build/matrix/${cc}_O3" $cc "-O3" "" "" ""
         row "${cc}_native" "build/matrix/${cc}_native" $cc "-O3 -march=native -ffp-contract=fast" "" "" ""
         isa_row "${cc}_native_scalar" "build/matrix/${cc}_native" $cc "-O3 -march=native -ffp-contract=fast" scalar ""
-        isa_row "${cc}_masm" "build/matrix/${cc}_masm" $cc "-O2 -masm=intel" "" "" test_kernels test_half test_net
+        isa_row "${cc}_masm" "build/matrix/${cc}_masm" $cc "-O2 -masm=intel" "" "" test_inside test_net
         row "${cc}_fast_math" "build/matrix/${cc}_fast_math" $cc "-O2 -ffast-math" "" "" ""
         isa_row "${cc}_fast_math_scalar" "build/matrix/${cc}_fast_math" $cc "-O2 -ffast-math" scalar ""
         if can $cc -fopenmp; then
@@ -159,7 +161,7 @@ fi
 if have aarch64-linux-gnu-gcc && have qemu-aarch64; then
     # All of it takes an emulator too long for every change.
     row aarch64 build/matrix/aarch64 aarch64-linux-gnu-gcc "-O2 -static" "" 1 qemu-aarch64 \
-        ${quick:+test_kernels test_outline test_camera}
+        ${quick:+test_inside test_outline test_camera}
     [ -n "$quick" ] || row aarch64_scalar build/matrix/aarch64 aarch64-linux-gnu-gcc "-O2 -static" scalar 1 qemu-aarch64
 else
     skip_row aarch64 "aarch64-linux-gnu-gcc and qemu-aarch64 are not both installed"
@@ -172,7 +174,7 @@ if [ -z "$quick" ]; then
         skip_row riscv64 "riscv64-linux-gnu-gcc and qemu-riscv64 are not both installed"
     fi
     if have s390x-linux-gnu-gcc && have qemu-s390x; then # the highest byte first
-        set -- test_archive test_color test_files test_kernels test_mesh test_net test_render
+        set -- test_color test_files test_inside test_mesh test_net test_render
         row s390x build/matrix/s390x s390x-linux-gnu-gcc "-O2 -static" "" 1 qemu-s390x "$@"
     else
         skip_row s390x "s390x-linux-gnu-gcc and qemu-s390x are not both installed"

@@ -2030,7 +2030,7 @@ TEST(certified_pictures_of_nets_miss_nothing)
                    (double)field.lipschitz, (double)field.lipschitz_far, (double)field.certified,
                    (double)field.certified_far, missed, hits);
         most.certified = most.certified_far = 0;
-        if (k == 0) CHECK(missed_of_net(ctx, &most, &hits) > 0);
+        if (k == 0 && !test_quick()) CHECK(missed_of_net(ctx, &most, &hits) > 0);
         dist_shape_destroy(shape);
         dist_net_destroy(net);
     }
@@ -2137,7 +2137,7 @@ TEST(error_bounds_hold_for_999_hits_of_1000_of_real_decoders)
     if (!probe) SKIP("no test data: set DIST_DATA");
     fclose(probe);
     dist_context *ctx = test_context();
-    for (size_t k = 0; k < sizeof names / sizeof *names; k++) {
+    for (size_t k = 0; k < (test_quick() ? 3 : sizeof names / sizeof *names); k++) {
         char file[64];
         const char *dot = strchr(names[k], '.');
         if (dist_context_isa(ctx) == DIST_ISA_SCALAR && (names[k][0] == 'c' || names[k][0] == 'm')) {

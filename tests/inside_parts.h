@@ -1,7 +1,6 @@
 /* SPDX-License-Identifier: MIT-0
    Parts that no declaration shows: single steps of the tracer's rays, from states that rays of decoders were in, and
    the order in which a net's points are put. */
-#define TEST_INSIDE
 #include "shapes.h"
 
 static dist_render_desc plain_how(void)
@@ -281,13 +280,11 @@ TEST(points_put_in_order_are_all_there_and_neighbors_stand_together)
     }
 }
 
-int main(int argc, char **argv)
+static void run_parts(void)
 {
-    test_begin(argc, argv);
     RUN(bounds_reach_to_where_f_was_foretold_to_cross_and_over_what_is_flat);
     RUN(steps_that_may_have_gone_through_something_are_taken_back);
     RUN(what_neighbors_were_off_counts_by_the_distance_they_were_predicted_from);
     RUN(flat_rays_end_at_samples_within_epsilon);
     RUN(points_put_in_order_are_all_there_and_neighbors_stand_together);
-    return test_report();
 }

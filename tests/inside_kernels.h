@@ -2,7 +2,6 @@
    Each kernel of each instruction set against the formula of section 03, computed in double.
    What a kernel has no business reading (unlisted rows, columns beyond the last, padding) is NaN, so that a value which
    leaks from there shows itself; what it has no business writing must keep its bytes. */
-#define TEST_INSIDE
 #include "test.h"
 
 #include <float.h>
@@ -41,19 +40,19 @@ static float test_nan(void)
     return x;
 }
 
-static test_allocator memory;
+static test_allocator kernel_memory;
 
 /* Aligned to 64 bytes and no more, NaN everywhere, with guards that test_free looks at. */
 static float *floats(size_t n)
 {
-    float *p = (float *)test_alloc(&memory, n * sizeof(float), 64);
+    float *p = (float *)test_alloc(&kernel_memory, n * sizeof(float), 64);
     for (size_t i = 0; i < n; i++) p[i] = test_nan();
     return p;
 }
 
 static void release(float *p, size_t n)
 {
-    test_free(&memory, p, n * sizeof(float));
+    test_free(&kernel_memory, p, n * sizeof(float));
 }
 
 /* rows of TEST_BLOCK with numbers in the first columns of the listed rows only (NULL: all) */
@@ -107,7 +106,7 @@ static void check_gemm_case(const disti_kernels *kernels, test_random *random, t
 {
     const int padded = rounded(size.out);
     int list[TEST_LONGEST];
-    uint64_t *mask = (uint64_t *)test_alloc(&memory, (size_t)padded * sizeof(uint64_t), 64);
+    uint64_t *mask = (uint64_t *)test_alloc(&kernel_memory, (size_t)padded * sizeof(uint64_t), 64);
     disti_gemm g;
     memset(&g, 0, sizeof g);
     g.rows = size.rows;
@@ -143,7 +142,7 @@ static void check_gemm_case(const disti_kernels *kernels, test_random *random, t
         }
         if (with_mask) CHECK(mask[o] >> size.columns == 0);
     }
-    test_free(&memory, mask, (size_t)padded * sizeof(uint64_t));
+    test_free(&kernel_memory, mask, (size_t)padded * sizeof(uint64_t));
     release(weights, (size_t)padded * (size_t)size.rows);
     release(bias, (size_t)padded);
     release(x, (size_t)size.rows * TEST_BLOCK);
@@ -643,7 +642,7 @@ static void check_all_sizes(int isa, int what)
     if (!test_cpu_has(isa)) SKIP("this processor or build lacks the instruction set");
     const disti_kernels kernels = disti_kernels_for(isa);
     test_random random = test_random_seed(3);
-    memset(&memory, 0, sizeof memory);
+    memset(&kernel_memory, 0, sizeof kernel_memory);
     for (int n = 0; n < TEST_CASES; n += test_quick() ? 7 : 1) {
         const test_size size = test_case(n);
         for (int variant = 0; variant < 4; variant++) {
@@ -661,8 +660,8 @@ static void check_all_sizes(int isa, int what)
             if (what == FEWER_COLUMNS && variant < 2) check_same_bits(&kernels, &random, size, 0, variant);
         }
     }
-    CHECK_EQUAL(0, memory.live_blocks);
-    CHECK_EQUAL(0, memory.errors);
+    CHECK_EQUAL(0, kernel_memory.live_blocks);
+    CHECK_EQUAL(0, kernel_memory.errors);
 }
 
 /* Guard zones and rows that are not listed are looked at in all of them. */
@@ -762,9 +761,8 @@ TEST(spans_are_what_spheres_cover_of_another_line)
     }
 }
 
-int main(int argc, char **argv)
+static void run_kernels(void)
 {
-    test_begin(argc, argv);
     RUN(spans_are_what_spheres_cover_of_another_line);
     RUN(the_processor_is_recognized_as_the_compiler_does_it);
     RUN(the_best_instruction_set_is_the_last_that_the_processor_has);
@@ -773,5 +771,4 @@ int main(int argc, char **argv)
     RUN_KERNELS(avx2);
     RUN_KERNELS(avx512);
     RUN_KERNELS(neon);
-    return test_report();
 }

@@ -1,6 +1,5 @@
 /* SPDX-License-Identifier: MIT-0
-   test_half.c - networks in 16 bits: each kernel against f32, ragged sizes, overflow, what is refused */
-#define TEST_INSIDE
+   inside_half.h - networks in 16 bits: each kernel against f32, ragged sizes, overflow, what is refused */
 #include "test.h"
 
 #include "../examples/common.h"
@@ -535,9 +534,8 @@ TEST(error_bounds_count_in_what_any_coarse_fn_is_off)
     }
 }
 
-int main(int argc, char **argv)
+static void run_half(void)
 {
-    test_begin(argc, argv);
     RUN(every_form_of_file_in_16_bits_is_within_its_bound_and_the_same_bits_in_every_batch);
     RUN(ragged_widths_in_16_bits);
     RUN(what_16_bits_are_off_is_measured_point_by_point_where_no_block_tells);
@@ -550,5 +548,4 @@ int main(int argc, char **argv)
     RUN(error_bounds_of_a_picture_in_16_bits_count_in_what_its_values_are_off);
     RUN(error_bounds_in_bf16_hold_for_999_of_1000_hits_of_trained_nets);
     RUN(error_bounds_count_in_what_any_coarse_fn_is_off);
-    return test_report();
 }

@@ -1,6 +1,5 @@
 /* SPDX-License-Identifier: MIT-0
-   test_archive.c - the safetensors reader and writer, and the numbers of its metadata */
-#define TEST_INSIDE
+   inside_archive.h - the safetensors reader and writer, and the numbers of its metadata */
 #include "test.h"
 
 #define LESSER(a, b) ((a) < (b) ? (a) : (b))
@@ -822,9 +821,8 @@ TEST(real_models_open)
     if (found < 8) SKIP("not all models are in DIST_DATA or ../shared/data");
 }
 
-int main(int argc, char **argv)
+static void run_archive(void)
 {
-    test_begin(argc, argv);
     RUN(what_is_written_is_read_back);
     RUN(reading_and_writing_again_gives_the_same_bytes);
     RUN(data_begins_at_a_multiple_of_eight);
@@ -856,5 +854,4 @@ int main(int argc, char **argv)
     RUN(metadata_beyond_its_limit_is_refused);
     RUN(twenty_thousand_mutations_are_opened_or_refused_cleanly);
     RUN(real_models_open);
-    return test_report();
 }

@@ -9300,6 +9300,7 @@ static dist_status disti_loader_channels(disti_loader *loader)
 {
     dist_net *net = loader->net;
     const char *s = disti_archive_meta(&loader->archive, "dist.channels");
+    int twice = 0;
     if (!s) s = "sdf";
     while (net->channels < DISTI_MAX_CHANNELS) {
         s += strspn(s, " ");
@@ -9309,14 +9310,17 @@ static dist_status disti_loader_channels(disti_loader *loader)
         int c = net->channels++;
         char(*names)[8] = net->channel_names;
         memcpy(names[c], s, n);
-        if (strcmp(names[c], "sdf") == 0 && net->sdf_channel < 0) net->sdf_channel = c;
+        for (int k = 0; k < c; k++) twice |= strcmp(names[k], names[c]) == 0;
+        if (strcmp(names[c], "sdf") == 0) net->sdf_channel = c;
         if (c >= 2 && strcmp(names[c - 2], "r") == 0 && strcmp(names[c - 1], "g") == 0 && strcmp(names[c], "b") == 0)
             net->color_channel = c - 2;
         s += whole;
-        if (!*s) return DIST_OK;
+        if (!*s && !twice) return DIST_OK;
+        if (!*s) break;
         s++;
     }
-    return disti_loader_bad(loader, "dist.channels", "1 to 16 names of up to 7 characters, with commas between");
+    return disti_loader_bad(loader, "dist.channels",
+                            "1 to 16 different names of up to 7 characters, with commas between");
 }
 
 /* A misspelled key would be one that is absent. */
@@ -9494,8 +9498,14 @@ static dist_status disti_loader_shapes(disti_loader *loader)
     const disti_tensor *gain;
     double at;
     loader->prefix = "";
-    if (!disti_loader_weight(loader, 0, &gain)) loader->prefix = "module.";
-    if (!disti_loader_weight(loader, 0, &gain)) {
+    const disti_tensor *plain = disti_loader_weight(loader, 0, &gain);
+    loader->prefix = "module.";
+    const disti_tensor *wrapped = disti_loader_weight(loader, 0, &gain);
+    if (plain && wrapped)
+        return disti_loader_fail(loader, DIST_BAD_FILE, "dist_net_load: there are two networks, one with and one "
+                                 "without module. before its tensors' names", NULL, 0, 0);
+    if (plain) loader->prefix = "";
+    if (!plain && !wrapped) {
         if (disti_loader_half(loader, 0) != DIST_OK) return loader->status;
         loader->prefix = "";
     }
@@ -17943,8 +17953,8 @@ static dist_status disti_pfm_parse(dist_context *ctx, const char *label, const v
         need > left)
         return disti_fail(ctx, DIST_BAD_FILE, "dist_pfm_read (%s): truncated, %d of %d bytes of pixels are there",
                           label, (double)left, (double)side[0] * (double)side[1] * (4.0 * pfm->channels));
-    /* one white space ends the header; of \r\n the second is the picture's first byte unless there is one to spare */
-    int pair = t.at[0] == '\r' && left > need && t.at[1] == '\n';
+    /* one white space ends the header; a line end behind it is the picture's first byte unless there is one to spare */
+    int pair = t.at[0] != '\n' && left > need && t.at[1] == '\n';
     const unsigned char *first = (const unsigned char *)bytes;
     pfm->data = first + (t.at - (const char *)bytes) + (pair ? 2 : 1);
     return DIST_OK;
@@ -18122,6 +18132,11 @@ static void disti_skip_blank_obj(disti_text *t)
     }
 }
 
+static int disti_obj_word_ends(const disti_text *t)
+{
+    return t->at >= t->end || *t->at == '\\' || *t->at == '#' || disti_is_space(*t->at);
+}
+
 /* Without vertices: what disti_write_obj makes of an empty mesh, a comment and nothing else. */
 static int disti_read_obj(disti_mesh_text *r)
 {
@@ -18136,7 +18151,7 @@ static int disti_read_obj(disti_mesh_text *r)
         double v[3];
         for (int k = 0; !face && k < 3; k++) {
             disti_skip_blank_obj(t);
-            if (!disti_text_number(t, v + k))
+            if (!disti_text_number(t, v + k) || !disti_obj_word_ends(t))
                 return disti_mesh_fail(r, DIST_BAD_FILE, "a vertex must be three numbers", 0);
         }
         if (!face && !disti_mesh_read_vertex(r, v)) return 0;
@@ -18144,13 +18159,12 @@ static int disti_read_obj(disti_mesh_text *r)
             int64_t i = 0;
             disti_skip_blank_obj(t);
             if (t->at == t->end || disti_is_line_end(*t->at) || *t->at == '#') break;
-            if (!disti_text_integer(t, &i) ||
-                (t->at < t->end && *t->at != '/' && *t->at != '\\' && !disti_is_space(*t->at)))
+            if (!disti_text_integer(t, &i) || (!disti_obj_word_ends(t) && *t->at != '/'))
                 return disti_mesh_fail(r, DIST_BAD_FILE, "not a corner of a face", 0);
             if (i == 0 || i + (int64_t)r->mesh->vertex_count < 0)
                 return disti_mesh_fail(r, DIST_BAD_FILE, "a face has vertex %d, must count from 1, or back from -1 to "
                                                          "what stands before it", (double)i);
-            while (t->at < t->end && *t->at != '\\' && !disti_is_space(*t->at)) t->at++; /* texture and normal */
+            while (!disti_obj_word_ends(t)) t->at++; /* texture and normal */
             if (!disti_mesh_read_corner(r, k, (double)(i > 0 ? i - 1 : i + (int64_t)r->mesh->vertex_count))) return 0;
         }
     }

@@ -184,12 +184,22 @@ static void take_photos(fit *f, const dist_field *field)
     }
 }
 
+/* The next number of a PPM's header, over blanks and comments: 0 where there is none from 1 to 16384. */
+static int ppm_number(const char **at)
+{
+    while (**at == '#' || (**at && strchr(" \t\r\n", **at))) { *at += **at == '#' ? strcspn(*at, "\n") : 1; }
+    char *end = NULL;
+    long number = **at >= '0' && **at <= '9' ? strtol(*at, &end, 10) : 0;
+    if (number < 1 || number > 16384) { return 0; }
+    *at = end;
+    return (int)number;
+}
+
 /* A PFM, or a PPM with 8 bits. */
 static float *read_photo(dist_context *ctx, const char *path, int *width, int *height)
 {
     size_t size = 0;
     int channels = 0;
-    int used = 0;
     float *photo = NULL;
     if (path_ends_with(path, ".pfm")) {
         float *plane = dist_pfm_load(ctx, path, width, height, &channels);
@@ -201,14 +211,16 @@ static float *read_photo(dist_context *ctx, const char *path, int *width, int *h
         return photo;
     }
     unsigned char *bytes = read_file(path, &size);
-    if (sscanf((const char *)bytes, "P6 %d %d 255%n", width, height, &used) != 2 || !used || *width < 1 ||
-        *height < 1 || *width > 16384 || *height > 16384) {
-        fail("%s is not a PFM and not a PPM of 8 bits (\"P6 WIDTH HEIGHT 255\" without comments)", path);
+    const char *at = (const char *)bytes + 2;
+    int is_ppm = strncmp((const char *)bytes, "P6", 2) == 0 && (*width = ppm_number(&at)) > 0 && (*height = ppm_number(&at)) > 0;
+    if (!is_ppm || ppm_number(&at) != 255) {
+        fail("%s is not a PFM and not a PPM of 8 bits (\"P6 WIDTH HEIGHT 255\", sides of 1 to 16384)", path);
     }
     size_t n = 3 * (size_t)*width * (size_t)*height;
-    if (size < (size_t)used + 1 + n) { fail("%s is cut off", path); }
+    size_t used = (size_t)(at - (const char *)bytes) + 1; /* one blank ends the header */
+    if (size < used + n) { fail("%s is cut off", path); }
     photo = take_floats(n);
-    for (size_t i = 0; i < n; i++) { photo[i] = (float)bytes[(size_t)used + 1 + i] / 255.0f; }
+    for (size_t i = 0; i < n; i++) { photo[i] = (float)bytes[used + i] / 255.0f; }
     free(bytes);
     return photo;
 }
@@ -672,7 +684,7 @@ static void write_report(const fit *f, const float *chamfers, int trials, int go
         json_score(&j, "chamfer", when[i], scores[i].chamfer);
     }
     json_count(&j, "trials", (unsigned long long)trials);
-    json_count(&j, "trials_good", (unsigned long long)good);
+    if (!o->photos) { json_count(&j, "trials_good", (unsigned long long)good); } /* else the truth is not known */
     json_floats(&j, "chamfer_starts", (size_t)trials, chamfers);
     json_floats(&j, "chamfer_ends", (size_t)trials, chamfers + trials);
     json_count(&j, "queries", f->queries);

@@ -118,7 +118,7 @@ refuses a_demo_with_a_mask "its own shape" "$work/fit_depth" --demo --mask "$wor
 refuses a_demo_of_a_family_without_demo "they mean nothing" "$work/fit_depth" --demo-family planes --target 0 --out "$work/x"
 refuses two_observations "two observations" "$work/fit_photos" --photos none.txt --target 1 --out "$work/x"
 refuses starts_off_below_0 "0 to 180 degrees" "$work/fit_pose" --off -1,0 --out "$work/x"
-mkdir -p "$work/seen" && printf 'P6\n1 1\n255\nabc' >"$work/seen/one.ppm" &&
+mkdir -p "$work/seen" && printf 'P6 # by hand\n# twice\n1 1#\n255\nabc' >"$work/seen/one.ppm" &&
     echo "one.ppm nan 1 0 0 1 0 0 0 1 0 0 0 1 0 0 3" >"$work/seen/cameras.txt"
 refuses a_photo_without_a_camera "one.ppm: dist_tape_create: camera.fx is nan" "$work/fit_photos" --photos "$work/seen" --out "$work/x"
 refuses weights_of_no_code "there is no code" "$work/fit_pose" --weights 1,1,5 --out "$work/x"

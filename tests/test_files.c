@@ -70,7 +70,8 @@ TEST(pfm_reads_both_byte_orders_and_kinds_of_white_space)
         const char *header;
         int big;
     } cases[] = {{"Pf\n1 1\n1.0\n", 1}, {"Pf 1 1 -1 ", 0},     {"Pf\r\n1\t1\r\n-2.5e-1\r\n", 0},
-                 {"Pf\n1\n1\n+3\r", 1}, {"Pf\n1 1\n-1.\n", 0}, {"Pf\n\n 01 001 \n-.5\n", 0}};
+                 {"Pf\n1\n1\n+3\r", 1}, {"Pf\n1 1\n-1.\n", 0}, {"Pf\n\n 01 001 \n-.5\n", 0},
+                 {"Pf\n1 1\n-1.0 \n", 0}};
     for (size_t i = 0; i < sizeof cases / sizeof cases[0]; i++) {
         unsigned char bytes[64];
         size_t n = strlen(cases[i].header);
@@ -297,7 +298,8 @@ static const char *const good_files[] = {
     "4\n",
     "v 0 0 0\nv 1 0 0\nv 1 1 0\nf -3 -2 -1 4\nv 0 1 0",
     "v 0 0 \\\n0\nv 1 0 0\nv \\\r\n1 1\\\n 0\nv 0 1 0\nf 1 2/2\\\n 3 \\\r\\\r4\\\n\n",
-    "f 1 2 3\nf 1 3 4\nf 1 2\nf\n  v 0 0 0\n\tv\t1\t0\t0\r\nv 1 1 0 0.5 0.5 0.5\nv 0 1 0 # end\n"};
+    "f 1 2 3\nf 1 3 4\nf 1 2\nf\n  v 0 0 0\n\tv\t1\t0\t0\r\nv 1 1 0 0.5 0.5 0.5\nv 0 1 0 # end\n",
+    "v 0 0 0# one\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3# one\nf 1/1 3/2 4/3# two\n"};
 enum { GOOD_FILES = sizeof good_files / sizeof good_files[0] };
 
 TEST(every_dialect_reads_as_the_same_square)
@@ -416,6 +418,8 @@ TEST(mesh_files_that_mean_harm_are_refused_with_a_sentence)
         "OFF\n3 1 0\n0 0 0\n0 0 0\n0 0 0\n2.5 0 1 2\n",
         "v 0 0\n",
         "v 0 0 x\n",
+        "v 0 0 0abc\n",
+        "v 0 0.5.5 0\n",
         "v 1..2 0 0\n",
         "v 1.2.3 0 0\n",
         "v inf 0 0\n",

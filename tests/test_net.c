@@ -1326,6 +1326,8 @@ TEST(nothing_of_a_layer_is_left_out_without_a_word)
     size_t size;
     REFUSED(DIST_UNSUPPORTED, "tensor lin1.scale is of a layer", "",
             "lin0.weight 4 5;lin0.bias 4;lin1.weight 1 4;lin1.bias 1;lin1.scale 4;");
+    REFUSED(DIST_BAD_FILE, "there are two networks", "",
+            "module.lin0.weight 1 5;module.lin0.bias 1;lin0.weight_g 1 1;lin0.weight_v 1 5;lin0.bias 1;");
     REFUSED(DIST_BAD_FILE, "layer 0 has its weights twice", "",
             "lin0.weight 4 5;lin0.bias 4;lin0.weight_g 4 1;lin0.weight_v 4 5;lin1.weight 1 4;lin1.bias 1;");
     /* What makes another layer, but for its weight or half of it: the file would be a net of one layer less. */
@@ -1487,6 +1489,8 @@ TEST(metadata_that_means_nothing_is_refused_with_a_sentence)
                                            {"dist.channels", ""},
                                            {"dist.channels", ",sdf"},
                                            {"dist.channels", "sdf,"},
+                                           {"dist.channels", "sdf,sdf"},
+                                           {"dist.channels", "r,g,b,g,sdf"},
                                            {"dist.code_size", "two"}};
     for (size_t k = 0; k < sizeof wrong / sizeof wrong[0]; k++) {
         char meta[128];
@@ -1495,6 +1499,8 @@ TEST(metadata_that_means_nothing_is_refused_with_a_sentence)
     }
     REFUSED(DIST_BAD_FILE, "dist.bound is \"-1\", must be a number from 1e-6 to 1000000", "\"dist.bound\":\"-1\"",
             good_tensors);
+    REFUSED(DIST_BAD_FILE, "dist.channels is \"sdf,sdf\", must be 1 to 16 different names",
+            "\"dist.channels\":\"sdf,sdf\"", good_tensors);
     REFUSED(DIST_BAD_FILE, "dist.encoding.raw is \"0.5\", must be a whole number from 0 to 1",
             "\"dist.encoding.raw\":\"0.5\"", good_tensors);
     REFUSED(DIST_BAD_FILE, "dist.output is \"relu\", must be tanh|none|sigmoid|tanh:2", "\"dist.output\":\"relu\"",

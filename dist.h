@@ -8974,10 +8974,14 @@ static dist_status disti_net_arrange(dist_context *ctx, dist_net *net, const int
         layer->code = sees_input ? net->code_size : 0;
         layer->scale = l > 0 && skip[l] ? skip_scale : 1.0f;
         const char digits[3] = {(char)('0' + (l < 10 ? l : l / 10)), (char)(l < 10 ? 0 : '0' + l % 10), 0};
-        if (layer->in != layer->prev + (sees_input ? input : 0))
-            return disti_fail(ctx, DIST_BAD_FILE,
-                              "dist_net_load: layer %s is %d wide at its input, but what feeds it has %d", digits,
-                              layer->in, layer->prev + (sees_input ? input : 0));
+        int fed = layer->prev + (sees_input ? input : 0);
+        const char *wrong = "dist_net_load: layer %s is %d wide at its input, but what feeds it has %d";
+        if (l > 0 && skip[l])
+            wrong = "dist_net_load: layer %s, which dist.skip names, is %d wide at its input, but what feeds it is %d";
+        else if (layer->in == fed + input)
+            wrong = "dist_net_load: layer %s is %d wide at its input, but what feeds it has %d: it sees the net's input "
+                    "again, too, and metadata dist.skip must name it";
+        if (layer->in != fed) return disti_fail(ctx, DIST_BAD_FILE, wrong, digits, layer->in, fed);
         int at = layer->prev > 0 && !net->skip_input_first ? layer->prev : 0;
         layer->x_column = at > 0 || !sees_input ? 0 : input;
         layer->point_column = at + (net->point_first ? 0 : net->code_size);

@@ -212,7 +212,8 @@ static float *read_photo(dist_context *ctx, const char *path, int *width, int *h
     }
     unsigned char *bytes = read_file(path, &size);
     const char *at = (const char *)bytes + 2;
-    int is_ppm = strncmp((const char *)bytes, "P6", 2) == 0 && (*width = ppm_number(&at)) > 0 && (*height = ppm_number(&at)) > 0;
+    int is_ppm = strncmp((const char *)bytes, "P6", 2) == 0 && (*width = ppm_number(&at)) > 0 &&
+                 (*height = ppm_number(&at)) > 0;
     if (!is_ppm || ppm_number(&at) != 255) {
         fail("%s is not a PFM and not a PPM of 8 bits (\"P6 WIDTH HEIGHT 255\", sides of 1 to 16384)", path);
     }
@@ -798,6 +799,7 @@ static request read_options(int argc, char **argv)
     option_belongs(r.photos && (r.texture || r.color_code), "--texture and --color-code",
                    "are of photos that are taken, not of --photos");
     option_belongs(r.off[0] < 100.0f && !r.similarity, "--off", "is where --similarity starts, which is not given");
+    option_belongs(r.off[0] < 100.0f && r.photos, "--off", "is where fits to photos that are taken start; say --place");
     option_belongs(r.cells && r.gradient != GRADIENT_MESH, "--mesh-cells", "belongs to --gradient mesh");
     if (r.off[0] >= 100.0f) { r.off[0] = r.off[1] = 10.0f, r.off[2] = 0.1f; }
     if (!r.cells) { r.cells = 48; }

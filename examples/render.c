@@ -155,6 +155,9 @@ static job read_options(int argc, char **argv)
     if (j.lit && j.lighting.count == 0) { j.lighting.count = 2; }
     if (j.color_code && !j.texture) { fail("--color-code is of a texture: --texture names it"); }
     option_belongs(j.frames && (j.zoom || j.planes), "--zoom and --planes", "are of one picture, not of --turntable");
+    int shaded = !j.planes || j.planes & NORMAL || j.frames || j.lit || j.zoom;
+    option_belongs(j.samples > 1 && !shaded, "--samples-per-pixel",
+                   "belongs to shaded pictures, and --planes asks for none");
     if (j.zoom_at_given && !j.zoom) { fail("--zoom-at is of --zoom, which is not given"); }
     if (j.zoom_at_given && !(j.zoom_at[0] >= 0.0f && j.zoom_at[0] <= (float)j.view.width && j.zoom_at[1] >= 0.0f &&
                              j.zoom_at[1] <= (float)j.view.height)) {

@@ -129,6 +129,8 @@ refuses a_mesh_where_none_can_be "cannot be written" "$work/mesh" embedded --out
 refuses a_folder_as_a_stem "is a folder" "$work/render" embedded --out "$work"
 refuses options_without_effect "belongs to" "$work/fit_photos" --mesh-cells 20 --out "$work/x"
 refuses starts_of_no_similarity "where --similarity starts" "$work/fit_photos" --off 5,5,0.1 --out "$work/x"
+refuses starts_off_of_photos "say --place" "$work/fit_photos" --photos "$work/seen" --similarity --off 5,5,0.1 --out "$work/x"
+refuses samples_of_no_shaded_picture "asks for none" "$work/render" embedded --planes depth --samples-per-pixel 2 --out "$work/x"
 refuses lengths_that_differ "three ways" "$work/train" --steps 2 --epochs 2 --out "$work/x"
 refuses an_output_that_cannot_be "cannot be written" "$work/train" --steps 2 --out "$work"
 refuses arguments_where_there_are_none "takes no arguments" "$work/hello" --size 8

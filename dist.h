@@ -8977,10 +8977,10 @@ static dist_status disti_net_arrange(dist_context *ctx, dist_net *net, const int
         int fed = layer->prev + (sees_input ? input : 0);
         const char *wrong = "dist_net_load: layer %s is %d wide at its input, but what feeds it has %d";
         if (l > 0 && skip[l])
-            wrong = "dist_net_load: layer %s, which dist.skip names, is %d wide at its input, but what feeds it is %d";
+            wrong = "dist_net_load: layer %s, which dist.skip names, is %d wide at its input, not %d";
         else if (layer->in == fed + input)
-            wrong = "dist_net_load: layer %s is %d wide at its input, but what feeds it has %d: it sees the net's input "
-                    "again, too, and metadata dist.skip must name it";
+            wrong = "dist_net_load: layer %s is %d wide at its input, but what feeds it has %d: it sees the net's "
+                    "input again, too, and metadata dist.skip must name it";
         if (layer->in != fed) return disti_fail(ctx, DIST_BAD_FILE, wrong, digits, layer->in, fed);
         int at = layer->prev > 0 && !net->skip_input_first ? layer->prev : 0;
         layer->x_column = at > 0 || !sees_input ? 0 : input;

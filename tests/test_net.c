@@ -1516,7 +1516,8 @@ TEST(metadata_that_means_nothing_is_refused_with_a_sentence)
     REFUSED(DIST_BAD_FILE, "layer 0 takes 5", "\"dist.code_size\":\"3\"", good_tensors);
     REFUSED(DIST_BAD_FILE, "layer 1, which dist.skip names, is 4 wide", "\"dist.skip\":\"1\"", good_tensors);
     REFUSED(DIST_BAD_FILE, "layer 1 is 9 wide at its input, but what feeds it has 4: it sees the net's input again",
-            "\"dist.skip\":\"2\"", "lin0.weight 4 5;lin0.bias 4;lin1.weight 4 9;lin1.bias 4;lin2.weight 1 9;lin2.bias 1;");
+            "\"dist.skip\":\"2\"", "lin0.weight 4 5;lin0.bias 4;lin1.weight 4 9;lin1.bias 4;"
+            "lin2.weight 1 9;lin2.bias 1;");
     REFUSED(DIST_BAD_FILE, "layer 1 is 8 wide at its input, but what feeds it has 4", "",
             "lin0.weight 4 5;lin0.bias 4;lin1.weight 1 8;lin1.bias 1;");
     char list[40 + 2 * 40] = "\"dist.skip\":\""; /* more layers than there can be */

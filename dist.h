@@ -929,7 +929,7 @@ DIST_API float *dist_pfm_load(dist_context *ctx, const char *path, int *width, i
 DIST_API void dist_pfm_free(dist_context *ctx, float *pixels, int width, int height, int channels);
 
 #ifndef DIST_NO_MESH
-/* Mesh files in memory. read: PLY (ascii, binary little-endian; triangles and polygons), OBJ (v, f; polygons
+/* Mesh files in memory. read: PLY (ascii, binary of either order; triangles and polygons), OBJ (v, f; polygons
    fanned), OFF; told apart by their first bytes; normals and faces of fewer than three corners are left out. write:
    PLY binary, or OBJ. */
 enum { DIST_MESH_PLY = 0, DIST_MESH_OBJ = 1 };
@@ -18245,7 +18245,7 @@ typedef struct disti_ply_element {
 } disti_ply_element;
 
 typedef struct disti_ply {
-    int has_format, ascii, element_count, property_count;
+    int has_format, ascii, big_endian, element_count, property_count;
     disti_ply_element elements[DISTI_PLY_ELEMENTS];
     disti_ply_property properties[DISTI_PLY_PROPERTIES];
 } disti_ply;
@@ -18321,8 +18321,10 @@ static int disti_ply_header(disti_mesh_text *r, disti_ply *ply)
         } else if (disti_ply_word(t, "format")) {
             ply->has_format = 1;
             ply->ascii = disti_ply_word(t, "ascii");
-            if (!ply->ascii && !disti_ply_word(t, "binary_little_endian"))
-                return disti_mesh_fail(r, DIST_UNSUPPORTED, "PLY must be ascii or binary_little_endian", 0);
+            ply->big_endian = disti_ply_word(t, "binary_big_endian");
+            if (!ply->ascii && !ply->big_endian && !disti_ply_word(t, "binary_little_endian"))
+                return disti_mesh_fail(r, DIST_BAD_FILE, "the PLY format is none of ascii, binary_little_endian and "
+                                                         "binary_big_endian", 0);
         } else if (disti_ply_word(t, "element")) {
             if (!disti_ply_element_line(r, ply)) return 0;
         } else if (disti_ply_word(t, "property")) {
@@ -18345,7 +18347,8 @@ static int disti_ply_value(disti_mesh_text *r, const disti_ply *ply, int type, d
     }
     if (t->end - t->at < sizes[type])
         return disti_mesh_fail(r, DIST_BAD_FILE, "truncated", 0);
-    for (int i = 0; i < sizes[type]; i++) bits |= (uint64_t)(unsigned char)*t->at++ << 8 * i;
+    for (int i = 0, last = sizes[type] - 1; i <= last; i++)
+        bits |= (uint64_t)(unsigned char)*t->at++ << 8 * (ply->big_endian ? last - i : i);
     uint32_t low = (uint32_t)(bits & 0xffffffffu);
     uint64_t sign = (uint64_t)1 << (8 * sizes[type] - 1);
     if (type == 7) memcpy(out, &bits, sizeof bits);

@@ -321,44 +321,61 @@ TEST(every_dialect_reads_as_the_same_square)
     dist_context_destroy(ctx);
 }
 
-TEST(binary_ply_of_mixed_types_is_read)
+/* The bytes of one number, which stand as in a little-endian file, as they stand in a big-endian one. */
+static void files_turn(int big, size_t n, unsigned char *bytes)
 {
-    dist_context *ctx = test_context();
-    static const char header[] =
-        "ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty short skip\nproperty double x\n"
-        "property float y\nproperty double z\nelement face 1\nproperty list ushort short vertex_indices\n"
-        "end_header\n";
-    unsigned char bytes[sizeof header + 200];
-    size_t n = sizeof header - 1;
-    memcpy(bytes, header, n);
-    for (int i = 0; i < 3; i++) {
-        double x = 1.5 * i, z = -i;
-        float y = 0.25f * (float)(i * i);
-        memset(bytes + n, 0xff, 2);
-        files_little(8, &x, bytes + n + 2);
-        files_little(4, &y, bytes + n + 10);
-        files_little(8, &z, bytes + n + 14);
-        n += 22;
+    for (size_t i = 0; big && i < n / 2; i++) {
+        unsigned char keep = bytes[i];
+        bytes[i] = bytes[n - 1 - i];
+        bytes[n - 1 - i] = keep;
     }
-    static const unsigned char face[8] = {3, 0, 2, 0, 1, 0, 0, 0};
-    memcpy(bytes + n, face, 8);
-    dist_mesh *mesh = dist_mesh_read(ctx, bytes, n + 8);
-    if (CHECK(mesh != NULL)) {
-        CHECK(mesh->triangles[0] == 2 && mesh->triangles[1] == 1 && mesh->triangles[2] == 0);
-        CHECK_NEAR(3, mesh->vertices[6], 0);
-        CHECK_NEAR(1, mesh->vertices[7], 0);
-        CHECK_NEAR(-2, mesh->vertices[8], 0);
-    }
-    dist_mesh_destroy(mesh);
-    bytes[n + 3] = 0xff; /* index -254 */
-    CHECK(!dist_mesh_read(ctx, bytes, n + 8));
-    CHECK_STATUS(DIST_BAD_FILE, dist_context_status(ctx), ctx);
-    dist_context_clear(ctx);
-    for (size_t cut = 0; cut < n + 8; cut++) {
-        CHECK(!dist_mesh_read(ctx, bytes, cut));
+}
+
+TEST(binary_ply_of_mixed_types_and_either_order_is_read)
+{
+    for (int big = 0; big < 2; big++) {
+        dist_context *ctx = test_context();
+        char header[256];
+        (void)snprintf(header, sizeof header,
+                       "ply\nformat binary_%s_endian 1.0\nelement vertex 3\nproperty short skip\nproperty double x\n"
+                       "property float y\nproperty double z\nelement face 1\nproperty list ushort short "
+                       "vertex_indices\nend_header\n", big ? "big" : "little");
+        unsigned char bytes[sizeof header + 200];
+        size_t n = strlen(header);
+        memcpy(bytes, header, n);
+        for (int i = 0; i < 3; i++) {
+            double x = 1.5 * i, z = -i;
+            float y = 0.25f * (float)(i * i);
+            memset(bytes + n, 0xff, 2);
+            files_little(8, &x, bytes + n + 2);
+            files_little(4, &y, bytes + n + 10);
+            files_little(8, &z, bytes + n + 14);
+            files_turn(big, 8, bytes + n + 2);
+            files_turn(big, 4, bytes + n + 10);
+            files_turn(big, 8, bytes + n + 14);
+            n += 22;
+        }
+        static const unsigned char face[8] = {3, 0, 2, 0, 1, 0, 0, 0};
+        memcpy(bytes + n, face, 8);
+        for (size_t i = 0; i < 8; i += 2) files_turn(big, 2, bytes + n + i);
+        dist_mesh *mesh = dist_mesh_read(ctx, bytes, n + 8);
+        if (CHECK(mesh != NULL)) {
+            CHECK(mesh->triangles[0] == 2 && mesh->triangles[1] == 1 && mesh->triangles[2] == 0);
+            CHECK_NEAR(3, mesh->vertices[6], 0);
+            CHECK_NEAR(1, mesh->vertices[7], 0);
+            CHECK_NEAR(-2, mesh->vertices[8], 0);
+        }
+        dist_mesh_destroy(mesh);
+        bytes[n + (big ? 2 : 3)] = 0xff; /* index -254 */
+        CHECK(!dist_mesh_read(ctx, bytes, n + 8));
+        CHECK_STATUS(DIST_BAD_FILE, dist_context_status(ctx), ctx);
         dist_context_clear(ctx);
+        for (size_t cut = 0; cut < n + 8; cut++) {
+            CHECK(!dist_mesh_read(ctx, bytes, cut));
+            dist_context_clear(ctx);
+        }
+        dist_context_destroy(ctx);
     }
-    dist_context_destroy(ctx);
 }
 
 #define PLY "ply\nformat ascii 1.0\n"
@@ -449,7 +466,8 @@ TEST(mesh_files_that_mean_harm_are_refused_with_a_sentence)
             "element face 1\nproperty list int int vertex_indices\nend_header\n0 0 0\n-3 0 0 0\n",
         PLY "element vertex 4000000000\n" XYZ "end_header\n0 0 0\n",
         PLY "element vertex 99999999999999999999\n" XYZ "end_header\n",
-        "ply\nformat binary_big_endian 1.0\nelement vertex 0\n" XYZ "end_header\n",
+        "ply\nformat binary_middle_endian 1.0\nelement vertex 0\n" XYZ "end_header\n",
+        "ply\nformat binary_big_endian 1.0\nelement vertex 2\n" XYZ "end_header\n0123456789ab",
         "ply\nformat binary_little_endian 1.0\nelement vertex 4000000000\n" XYZ "end_header\n0123456789ab"};
     for (size_t i = 0; i < sizeof files / sizeof files[0]; i++) {
         dist_mesh *mesh = files_text(ctx, files[i]);
@@ -736,7 +754,7 @@ int main(int argc, char **argv)
     RUN(normals_are_written_to_both_formats);
     RUN(every_dialect_reads_as_the_same_square);
     RUN(what_a_mesh_file_has_wrong_is_told_as_the_file_counts);
-    RUN(binary_ply_of_mixed_types_is_read);
+    RUN(binary_ply_of_mixed_types_and_either_order_is_read);
     RUN(lines_end_as_they_like_and_a_mark_of_utf8_is_no_vertex);
     RUN(mesh_files_that_mean_harm_are_refused_with_a_sentence);
     RUN(mutated_meshes_never_crash_leak_or_take_much_memory);

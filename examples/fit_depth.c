@@ -250,6 +250,7 @@ static void write_report(const fit *f, const score scores[2], const dist_stats *
     char path[PATH_SIZE];
     json j = json_open(path_of(path, o->out, ".json"));
     json_text(&j, "model", o->model);
+    json_text(&j, "observed", o->depth_path ? o->depth_path : o->target ? o->target : "the demo's shape");
     for (int i = 0; i < 2; i++) {
         json_score(&j, "loss", when[i], scores[i].loss);
         json_score(&j, "depth_error", when[i], scores[i].depth_error);

@@ -70,6 +70,8 @@ tells_all() {
     done
 }
 expect fit_depth_tells_all tells_all "$work/fit_depth" --demo --size 32 --iterations 2
+sees_the_demo() { grep -q '^  "observed": "the demo' "$work/told.json"; }
+expect fit_depth_tells_what_was_observed sees_the_demo
 expect fit_depth_tells_all_of_a_target tells_all "$work/fit_depth" --size 32 --iterations 2
 # The mask may be another picture's, with the depth of a shape of the model, too.
 masked() {

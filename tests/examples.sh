@@ -123,6 +123,18 @@ refuses starts_off_below_0 "0 to 180 degrees" "$work/fit_pose" --off -1,0 --out 
 mkdir -p "$work/seen" && printf 'P6 # by hand\n# twice\n1 1#\n255\nabc' >"$work/seen/one.ppm" &&
     echo "one.ppm nan 1 0 0 1 0 0 0 1 0 0 0 1 0 0 3" >"$work/seen/cameras.txt"
 refuses a_photo_without_a_camera "one.ppm: dist_tape_create: camera.fx is nan" "$work/fit_photos" --photos "$work/seen" --out "$work/x"
+# Comments in a photo's header move no pixel of it.
+comments_move_nothing() {
+    "$work/fit_photos" --views 2 --size 24x24 --iterations 1 --save "$work/photos" --out "$work/taken" &&
+        "$work/fit_photos" --photos "$work/photos" --iterations 1 --out "$work/plain" || return
+    for photo in "$work"/photos/*.ppm; do
+        { printf 'P6 # by hand\n' && tail -c +4 "$photo"; } >"$work/photo" && mv "$work/photo" "$photo" || return
+    done
+    "$work/fit_photos" --photos "$work/photos" --iterations 1 --out "$work/commented" || return
+    for of in plain commented; do grep '"loss_' "$work/$of.json" >"$work/$of.loss"; done
+    cat "$work/plain.loss" && [ -s "$work/plain.loss" ] && cmp "$work/plain.loss" "$work/commented.loss"
+}
+expect photos_with_comments_are_the_same comments_move_nothing
 refuses weights_of_no_code "there is no code" "$work/fit_pose" --weights 1,1,5 --out "$work/x"
 refuses starts_off_too_far "a distance of 0 to 1000" "$work/fit_pose" --off 5,1e9 --out "$work/x"
 refuses a_fit_of_what_is_not_seen "nothing to fit" "$work/fit_depth" --demo --no-mask --weights 0,1,0 --out "$work/x"
